@@ -1,0 +1,63 @@
+"""What every operator needs to pass torch tensors to Warp: checks, zero-copy views and the stream."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+import warp as wp
+
+if wp.config.log_level == wp.LOG_INFO:  # the user's own setting stays; Warp's default prints at every module load
+    wp.config.log_level = wp.LOG_WARNING
+
+_DTYPES = {torch.float32: "float32", torch.int32: "int32"}
+
+
+def expect(
+    name: str,
+    tensor: torch.Tensor,
+    shape: tuple[int | None, ...],
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | None = None,
+) -> None:
+    """Refuses a tensor that a kernel could not read.
+
+    Args:
+        name: What the caller calls it.
+        tensor: The argument.
+        shape: Expected shape; None stands for any length.
+        dtype: Expected type.
+        device: Expected device, where another argument has set it.
+
+    Raises:
+        TypeError: Not a tensor, or of another dtype.
+        ValueError: Another shape or device.
+    """
+    if not isinstance(tensor, torch.Tensor):
+        raise TypeError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
+    if tensor.dtype != dtype:
+        wanted = _DTYPES.get(dtype, str(dtype))
+        raise TypeError(f"{name} must be {wanted}, got {str(tensor.dtype)[6:]}; use .to(torch.{wanted})")
+    fits = tensor.ndim == len(shape) and all(w is None or w == n for w, n in zip(shape, tensor.shape, strict=True))
+    if not fits:
+        wanted = "[" + ", ".join("*" if n is None else str(n) for n in shape) + "]"
+        raise ValueError(f"{name} must have shape {wanted}, got {list(tensor.shape)}")
+    if device is not None and tensor.device != device:
+        raise ValueError(f"{name} is on {tensor.device}, the other arguments are on {device}; move one of them")
+
+
+def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
+    """A Warp array over the tensor's memory; no copy where the tensor is contiguous, and no gradient buffer."""
+    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+
+
+@contextlib.contextmanager
+def torch_stream(device: torch.device) -> Iterator[wp.Device]:
+    """Launches inside run on torch's current stream of the device. Yields the Warp device."""
+    warp_device = wp.device_from_torch(device)
+    if device.type == "cuda":
+        with wp.ScopedStream(wp.stream_from_torch(device)):
+            yield warp_device
+    else:
+        yield warp_device
