@@ -49,12 +49,14 @@ def expect(
 
 def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A Warp array over the tensor's memory; no copy where the tensor is contiguous, and no gradient buffer."""
+    wp.init()
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
 
 @contextlib.contextmanager
 def torch_stream(device: torch.device) -> Iterator[wp.Device]:
     """Launches inside run on torch's current stream of the device. Yields the Warp device."""
+    wp.init()  # at first use and not at import, so that importing never touches a driver
     warp_device = wp.device_from_torch(device)
     if device.type == "cuda":
         with wp.ScopedStream(wp.stream_from_torch(device)):

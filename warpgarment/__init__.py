@@ -1,0 +1,65 @@
+"""Neural garment dynamics for any garment on any moving body, on NVIDIA Warp and PyTorch."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from . import demo, draw, geodesics, metrics
+    from .body import BodyMotion
+    from .errors import CheckpointError, MeshError, MissingExtra
+    from .fitting import fit
+    from .garment import Garment
+    from .motion import GarmentMotion
+    from .network import ManifoldAwareTransformer, NetworkConfig
+    from .simulator import Simulator
+    from .status import RolloutStatus, Verdict
+
+__all__ = [
+    "BodyMotion",
+    "CheckpointError",
+    "Garment",
+    "GarmentMotion",
+    "ManifoldAwareTransformer",
+    "MeshError",
+    "MissingExtra",
+    "NetworkConfig",
+    "RolloutStatus",
+    "Simulator",
+    "Verdict",
+    "demo",
+    "draw",
+    "fit",
+    "geodesics",
+    "metrics",
+]
+
+# Where a public name lives. Names are imported when first used: `warpgarment --help` waits for neither torch nor Warp.
+_HOME = {
+    "BodyMotion": "body",
+    "CheckpointError": "errors",
+    "Garment": "garment",
+    "GarmentMotion": "motion",
+    "ManifoldAwareTransformer": "network",
+    "MeshError": "errors",
+    "MissingExtra": "errors",
+    "NetworkConfig": "network",
+    "RolloutStatus": "status",
+    "Simulator": "simulator",
+    "Verdict": "status",
+    "fit": "fitting",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = importlib.import_module(f".{_HOME.get(name, name)}", __name__)
+    value = getattr(home, name) if name in _HOME else home
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,137 @@
+"""The command line: `warpgarment <verb> --help`.
+
+A verb is a dataclass, whose fields are the options, and a function called with it. Nothing is imported before its
+verb is called, so help is quick and training's dependencies are asked for by training's verbs alone.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+_ROOM = "warpgarment"
+_EXTRAS = {
+    "newton": "physics",
+    "gpytoolbox": "physics",
+    "anny": "bodies",
+    "mannequin": "bodies",
+    "pxr": "usd",
+    "pyvista": "view",
+    "imageio": "view",
+    "imageio_ffmpeg": "view",
+    "PIL": "view",
+    "matplotlib": "view",
+    "tensorboard": "train",
+}  # what to install where a module is missing
+
+
+@dataclass(frozen=True)
+class Verb:
+    """Where a verb's options (a dataclass) and its function (called with the options) live."""
+
+    module: str
+    options: str
+    function: str
+    summary: str
+
+
+VERBS = {
+    "demo": Verb(
+        "cli.demo", "Demo", "run", "Roll out the bundled garments on the bundled body; film, USD and figures."
+    ),
+    "simulate": Verb("cli.simulate", "Simulate", "run", "Dress a moving body: garment file, body motion, output file."),
+    "generate": Verb(
+        "training.generate", "GenerateConfig", "generate", "Simulate training sequences with a physics teacher."
+    ),
+    "train": Verb("training.train", "TrainConfig", "train", "Train a network on sequences."),
+    "evaluate": Verb(
+        "training.evaluate", "EvaluateConfig", "evaluate", "Roll a network out on test sequences and measure it."
+    ),
+    "bench": Verb("cli.bench", "Bench", "run", "Time a rollout by stage on this machine."),
+    "view": Verb("cli.view", "View", "run", "Look at a motion, or draw it to a PNG or MP4 without a display."),
+    "convert": Verb("cli.convert", "Convert", "run", "Convert a motion between npz, USD, PC2 and folders of OBJ."),
+    "doctor": Verb("cli.doctor", "Doctor", "run", "Versions, devices, installed extras, and a quick self check."),
+}
+
+
+def usage() -> str:
+    """What `warpgarment --help` prints."""
+    verbs = "\n".join(f"  {name:<10}{verb.summary}" for name, verb in VERBS.items())
+    return (
+        "usage: warpgarment VERB [options]\n\n"
+        "Neural garment dynamics for any garment on any moving body.\n\n"
+        f"verbs:\n{verbs}\n\n"
+        "options:\n  -h, --help  this text, or a verb's options: warpgarment VERB --help\n"
+        "  --version   the installed version\n"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one verb.
+
+    Args:
+        arguments: Without the program's name; `sys.argv` by default.
+
+    Returns:
+        The exit status: 0, or 2 where the user has to change something, which one line on stderr names.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(usage(), end="")
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("warpgarment"))
+        return 0
+    name = arguments[0].replace("_", "-")
+    if name not in VERBS:
+        return _complain(f"there is no verb {arguments[0]!r}. Verbs: {', '.join(VERBS)}.")
+
+    from ..errors import CheckpointError, MeshError, MissingExtra
+
+    verb = VERBS[name]
+    try:
+        options = _options(verb, name, arguments[1:])
+        getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.function)(options)
+    except (MeshError, CheckpointError, MissingExtra, UsageError) as error:
+        return _complain(f"{type(error).__name__}: {error}")
+    except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
+        return _complain(f"{type(error).__name__}: {error}")
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        if extra is None:
+            raise
+        return _complain(f"MissingExtra: {MissingExtra(extra, f'warpgarment {name}')}")
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+class UsageError(ValueError):
+    """Options that parse but do not fit each other or the files they name."""
+
+
+MOTION_FORMATS = (".usd", ".usda", ".usdc", ".pc2", ".npz", "")
+
+
+def check_output(path: Path, suffixes: Sequence[str]) -> None:
+    """Refuses a file name that cannot be written, before time is spent on what goes into it."""
+    if path.suffix.lower() not in suffixes:
+        allowed = ", ".join(s or "a folder (no suffix)" for s in suffixes)
+        raise UsageError(f"cannot write {path.name!r}. Formats: {allowed}.")
+
+
+def _options(verb: Verb, name: str, arguments: Sequence[str]) -> object:
+    import tyro
+
+    config = getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.options)
+    return tyro.cli(config, prog=f"warpgarment {name}", args=list(arguments), description=f"{verb.summary}")
+
+
+def _complain(message: str) -> int:
+    print(f"warpgarment: {' '.join(message.split())}", file=sys.stderr)
+    return 2

@@ -1,0 +1,51 @@
+# make demo    installs the package in .venv and rolls out the bundled garments (out/demo/)
+# make test    installs what the tests need and runs them
+# make lint    ruff and mypy
+# make bench   times a rollout by stage on this machine
+#
+# PYTHON  interpreter the environment is made with           make demo PYTHON=python3.12
+# TORCH   what to give pip install for torch (a GPU build)   make demo TORCH="torch --index-url ..."
+# DEVICE  where the demo runs; by default a GPU if there is one
+
+PYTHON ?= python3
+TORCH ?= $(shell grep '^torch==' constraints.txt)
+DEVICE ?=
+WORKERS ?= 2
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
+# torch is installed first and by itself; left in, its line would contradict another TORCH
+CONSTRAINTS := $(VENV)/constraints.txt
+
+.PHONY: demo test lint bench clean
+.DELETE_ON_ERROR:
+
+demo: $(VENV)/.demo
+	$(BIN)/warpgarment demo --out out/demo $(if $(DEVICE),--device $(DEVICE))
+
+test: $(VENV)/.test
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal tests
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.demo
+	$(BIN)/warpgarment bench $(if $(DEVICE),--device $(DEVICE))
+
+clean:
+	rm -rf $(VENV) out build
+
+$(VENV)/.torch: constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) $(TORCH)
+	grep -v '^torch==' constraints.txt > $(CONSTRAINTS)
+	@touch $@
+
+$(VENV)/.demo: $(VENV)/.torch pyproject.toml
+	$(PIP) -c $(CONSTRAINTS) -e '.[usd,view]'
+	@touch $@
+
+$(VENV)/.test: $(VENV)/.torch pyproject.toml
+	$(PIP) -c $(CONSTRAINTS) -e '.[dev,usd,view,train,physics]'
+	@touch $@

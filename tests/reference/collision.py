@@ -1,0 +1,50 @@
+"""Float64 twin of kernels/collision.py: libigl's Laplacian and distances, and a sparse direct solve of all 3V unknowns."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import spsolve
+
+
+def contacts(vertices: np.ndarray, body_vertices: np.ndarray, body_faces: np.ndarray, epsilon: float):
+    """Indices of the vertices closer than epsilon, their closest surface points and outward directions."""
+    distance, _, closest, _ = igl.signed_distance(
+        vertices.astype(np.float64),
+        body_vertices.astype(np.float64),
+        body_faces.astype(np.int64),
+        igl.SIGNED_DISTANCE_TYPE_WINDING_NUMBER,
+    )
+    index = np.flatnonzero(distance < epsilon)
+    away = vertices[index].astype(np.float64) - closest[index]
+    return index, closest[index], np.sign(distance[index])[:, None] * away / np.linalg.norm(away, axis=1)[:, None]
+
+
+def base(rest: np.ndarray, faces: np.ndarray, lambda_lap: float, lambda_reg: float) -> sp.csr_matrix:
+    """λ_lap LᵀL + λ_reg I."""
+    laplacian = igl.cotmatrix(rest.astype(np.float64), faces.astype(np.int64))
+    return (lambda_lap * laplacian.T @ laplacian + lambda_reg * sp.eye(len(rest))).tocsr()
+
+
+def refine(
+    vertices: np.ndarray,
+    rest: np.ndarray,
+    faces: np.ndarray,
+    index: np.ndarray,
+    closest: np.ndarray,
+    normals: np.ndarray,
+    epsilon: float,
+    lambda_lap: float = 0.5,
+    lambda_reg: float = 1e-3,
+) -> np.ndarray:
+    """Minimiser of eq. 5 of the supplement for given contacts, solved for V itself rather than for an increment."""
+    vertices = vertices.astype(np.float64)
+    matrix = base(rest, faces, lambda_lap, lambda_reg)
+    rows = np.repeat(np.arange(len(index)), 3)
+    columns = (3 * index[:, None] + np.arange(3)).ravel()
+    constraint = sp.csr_matrix((normals.ravel(), (rows, columns)), shape=(len(index), vertices.size))
+    target = epsilon + (normals * closest).sum(1)
+    left = sp.kron(matrix, sp.eye(3)) + constraint.T @ constraint
+    right = (matrix @ vertices).ravel() + constraint.T @ target
+    return spsolve(left.tocsc(), right).reshape(-1, 3)

@@ -1,0 +1,92 @@
+"""The state of a training run in one safetensors file: weights, averaged weights, optimiser, pool, and where it stands.
+
+Random numbers need no state: every step draws its own from (seed, step).
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from warpgarment.errors import CheckpointError
+
+
+class Average:
+    """Exponential moving average of a network's weights; statistics are copied.
+
+    Args:
+        network: The network in training.
+        decay: Of the average; less at first, (1 + n) / (10 + n) after n updates.
+    """
+
+    def __init__(self, network: torch.nn.Module, decay: float) -> None:
+        self.network = copy.deepcopy(network).eval().requires_grad_(False)
+        self.decay, self.updates = decay, 0
+
+    @torch.no_grad()
+    def update(self, network: torch.nn.Module) -> None:
+        """Takes in the weights as they are now."""
+        weight = 1.0 - min(self.decay, (1.0 + self.updates) / (10.0 + self.updates))
+        self.updates += 1
+        torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), weight)
+        for mine, theirs in zip(self.network.buffers(), network.buffers(), strict=True):
+            mine.copy_(theirs)
+
+
+def save(
+    path: Path,
+    network: torch.nn.Module,
+    average: Average,
+    optimizer: torch.optim.Optimizer,
+    extra: dict[str, torch.Tensor],
+    progress: dict[str, Any],
+) -> None:
+    """Writes the state beside the path and renames it, so that a run can always go on from a whole file."""
+    tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
+    tensors |= {f"average.{k}": v for k, v in average.network.state_dict().items()}
+    for index, values in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{index}.{k}": torch.as_tensor(v) for k, v in values.items()}
+    tensors |= extra
+    tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+    temporary = path.with_name(f".{path.name}.partial")
+    save_file(tensors, temporary, metadata={"progress": json.dumps(progress | {"average_updates": average.updates})})
+    os.replace(temporary, path)
+
+
+def load(
+    path: Path, network: torch.nn.Module, average: Average, optimizer: torch.optim.Optimizer
+) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Restores what `save` wrote, in place.
+
+    Returns:
+        The extra tensors, and the progress.
+
+    Raises:
+        CheckpointError: The file is not a training state, or of another network.
+    """
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            progress = json.loads(file.metadata()["progress"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+        def part(prefix: str) -> dict[str, torch.Tensor]:
+            return {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
+
+        network.load_state_dict(part("network."))
+        average.network.load_state_dict(part("average."))
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in part("optimizer.").items():
+            index, key = name.split(".", 1)
+            state.setdefault(int(index), {})[key] = value
+        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    except Exception as error:
+        raise CheckpointError(f"{path}: cannot resume from this file ({error}); start anew with resume=False") from error
+    average.updates = progress["average_updates"]
+    return {k: v for k, v in tensors.items() if k.split(".")[0] not in ("network", "average", "optimizer")}, progress

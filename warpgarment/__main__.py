@@ -1,0 +1,7 @@
+"""`python -m warpgarment` is `warpgarment`."""
+
+import sys
+
+from .cli import main
+
+sys.exit(main())

@@ -1,0 +1,37 @@
+"""`warpgarment convert`: a motion from one file format to another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ..body import BodyMotion
+from . import MOTION_FORMATS, check_output
+
+
+@dataclass
+class Convert:
+    """Options of `convert`."""
+
+    input: tyro.conf.Positional[Path]
+    """Motion to read: .npz, .usd, .pc2 (with its .obj beside it), or a folder of .obj."""
+    output: tyro.conf.Positional[Path]
+    """Motion to write: .npz, .usd (.usda, .usdc), .pc2, or a folder of .obj."""
+    fps: float | None = None
+    """Resample to this rate; by default the rate stays."""
+    unit: str | None = None
+    """Length unit of the input where it is not metres: m, dm, cm, mm or in."""
+    mesh: str | None = None
+    """Name of the mesh to read where a USD file holds several."""
+
+
+def run(options: Convert) -> None:
+    """Reads, resamples if asked, writes."""
+    check_output(options.output, MOTION_FORMATS)
+    motion = BodyMotion.load(options.input, unit=options.unit, mesh=options.mesh, collider=False)
+    if options.fps is not None:
+        motion = motion.resampled(options.fps)
+    motion.save(options.output)
+    print(f"{options.output}: {motion.frames} frames at {motion.fps:g} fps, {motion.vertices.shape[1]} vertices")

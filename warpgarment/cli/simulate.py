@@ -1,0 +1,63 @@
+"""`warpgarment simulate`: a garment file and a body motion in, the garment's motion out."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from ..body import BodyMotion
+from ..garment import Garment
+from ..report import rollout_table
+from . import MOTION_FORMATS, check_output
+
+
+@dataclass
+class Simulate:
+    """Options of `simulate`."""
+
+    garment: tyro.conf.Positional[Path]
+    """Rest mesh of the garment, draped on the body's first frame (or see --fit-rest): .obj, .ply, .glb, .usd, .npz."""
+    body: tyro.conf.Positional[Path]
+    """Body motion: .npz, .usd, .pc2 with its .obj beside it, or a folder of .obj."""
+    out: Path
+    """Where to write: .usd, .pc2, .npz, or a folder of .obj (no suffix)."""
+    weights: str = "default"
+    """Network: a name that ships with the package, or a checkpoint file or folder."""
+    device: str | None = None
+    """cpu or cuda:0; by default a GPU where there is one."""
+    unit: str | None = None
+    """Length unit of the garment's file where it is not metres: m, dm, cm, mm or in."""
+    body_unit: str | None = None
+    """The same for the body's."""
+    body_mesh: str | None = None
+    """Name of the mesh where the body's USD file holds several."""
+    fit_rest: Path | None = None
+    """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
+    frames: int | None = None
+    """Simulate only the first so many frames."""
+
+
+def run(options: Simulate) -> None:
+    """Loads, fits if asked, rolls out, writes, and says how it went."""
+    check_output(options.out, MOTION_FORMATS)
+    from ..simulator import Simulator
+
+    garment = Garment.load(options.garment, unit=options.unit)
+    body = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh)
+    simulator = Simulator.from_pretrained(options.weights, device=options.device)
+    simulator.timings.synchronise = True
+    first = None
+    if options.fit_rest is not None:
+        from ..fit import fit
+
+        whole = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh, collider=False)
+        rest = BodyMotion.load(options.fit_rest, unit=options.body_unit, collider=False)
+        first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
+    motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, progress=sys.stderr.isatty())
+    motion.save(options.out)
+    name = garment.name or "garment"
+    print(rollout_table({name: motion}, {name: simulator.timings}))
+    print(f"\nwrote {options.out}")

@@ -1,0 +1,89 @@
+"""`warpgarment view`: a motion in a window, or drawn to a file where there is no display."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from .. import draw
+from ..body import BodyMotion
+from ..errors import MissingExtra
+from ..motion import GarmentMotion
+from . import UsageError, check_output
+
+
+@dataclass
+class View:
+    """Options of `view`."""
+
+    motion: tyro.conf.Positional[tuple[Path, ...]]
+    """Garment motions: .npz, .usd, .pc2 with its .obj beside it, or folders of .obj."""
+    mesh: str | None = None
+    """Name of the mesh to read where a USD file holds several."""
+    body: Path | None = None
+    """Body motion to draw with them."""
+    out: Path | None = None
+    """Draw to this file instead of a window: .mp4 the film, .png a sheet of moments."""
+    frames: int = 8
+    """Moments on a sheet."""
+    size: tuple[int, int] = (480, 640)
+    """Width and height of a film, of a panel of a sheet half that, in pixels."""
+    azimuth: float = 28.0
+    """Where the camera stands: degrees from the body's front (+Z) towards +X."""
+
+
+def run(options: View) -> None:
+    """Draws to a file, or opens a window."""
+    if not options.motion:
+        raise UsageError("view was given no motion. Name at least one file.")
+    if options.out is not None:
+        check_output(options.out, (".png", ".mp4"))
+    loaded = [BodyMotion.load(path, mesh=options.mesh, collider=False) for path in options.motion]
+    garments = [
+        GarmentMotion(m.vertices, m.faces, m.fps, name=p.stem) for m, p in zip(loaded, options.motion, strict=True)
+    ]
+    body = None if options.body is None else BodyMotion.load(options.body, collider=False)
+    if options.out is None:
+        _window(body, garments)
+        return
+    scene = [*([body] if body is not None else []), *garments]
+    if options.out.suffix.lower() == ".mp4":
+        camera = draw.chase(scene, size=options.size, azimuth=options.azimuth)
+        pictures = draw.film(body, garments, size=options.size, camera=camera)
+        draw.write_mp4(options.out, pictures, garments[0].fps)
+    else:
+        panel = (options.size[0] // 2, options.size[1] // 2)
+        camera = draw.chase(scene, size=panel, azimuth=options.azimuth)
+        rows = [(", ".join(m.name for m in garments), garments, draw.PALETTE)]
+        draw.sheet(options.out, body, rows, frames=options.frames, size=panel, camera=camera)
+    print(f"wrote {options.out}")
+
+
+def _window(body: BodyMotion | None, garments: list[GarmentMotion]) -> None:
+    """Plays in a loop until the window is closed."""
+    try:
+        import pyvista
+    except ModuleNotFoundError as error:
+        raise MissingExtra("view", "A window (without --out)") from error
+    plotter = pyvista.Plotter(title="warpgarment")
+    shown = []
+    for motion, color in [
+        *([(body, draw.SKIN)] if body is not None else []),
+        *zip(garments, draw.PALETTE * 16, strict=False),
+    ]:
+        mesh = pyvista.PolyData.from_regular_faces(motion.vertices[0].copy(), motion.faces)
+        plotter.add_mesh(mesh, color=color, smooth_shading=True)
+        shown.append((mesh, motion))
+    clock = [0]
+
+    def advance(_: int) -> None:
+        clock[0] += 1
+        for mesh, motion in shown:
+            mesh.points[:] = motion.vertices[clock[0] % motion.frames]
+            mesh.compute_normals(inplace=True, split_vertices=False)
+        plotter.render()
+
+    plotter.add_timer_event(max_steps=10**9, duration=round(1000 / garments[0].fps), callback=advance)
+    plotter.show()

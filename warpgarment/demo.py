@@ -1,0 +1,169 @@
+"""The demo: bundled garments on a bundled walking body, by the network that ships, beside their ground truth.
+
+`assets()` is also a first thing to play with: a body in motion, two garments, and physics to compare with.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from . import draw, metrics
+from .body import BodyMotion
+from .errors import MeshError
+from .garment import Garment
+from .io.usd import write_usd
+from .motion import GarmentMotion
+from .report import rollout_table
+
+ASSETS = Path(__file__).parent / "assets" / "demo"
+GARMENTS = ("dress", "tshirt")
+
+
+@dataclass(frozen=True)
+class DemoGarment:
+    """A bundled garment.
+
+    Attributes:
+        garment: At rest, with its pins.
+        truth: Simulated by the physics teacher on the demo's body, float32 [T, V, 3]; never seen in training.
+    """
+
+    garment: Garment
+    truth: GarmentMotion
+
+    @property
+    def first_vertices(self) -> np.ndarray:
+        """The garment draped on the first frame of the body [m], shape [V, 3]."""
+        return self.truth.vertices[0]
+
+
+@dataclass(frozen=True)
+class DemoAssets:
+    """What ships for the demo.
+
+    Attributes:
+        body: All of the walking body, to look at.
+        collider: What garments collide with: the body without parts such as hands.
+        garments: By name.
+    """
+
+    body: BodyMotion
+    collider: BodyMotion
+    garments: Mapping[str, DemoGarment]
+
+
+def assets(folder: str | Path | None = None) -> DemoAssets:
+    """Reads the bundled assets, or others of the same layout: body.npz and one .npz per garment.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        MeshError: A file holds something else.
+    """
+    folder = Path(folder) if folder is not None else ASSETS
+    body = BodyMotion.load(folder / "body.npz", collider=False)
+    garments = {}
+    for name in GARMENTS:
+        path = folder / f"{name}.npz"
+        with np.load(path, allow_pickle=False) as arrays:
+            missing = {"rest_vertices", "faces", "pins", "truth"} - set(arrays)
+            if missing:
+                raise MeshError(f"{path}: {sorted(missing)[0]!r} is missing; the demo's garments need it")
+            garment = Garment(arrays["rest_vertices"], arrays["faces"], pins=arrays["pins"], name=name)
+            truth = GarmentMotion(arrays["truth"].astype(np.float32), garment.faces, body.fps, name=name)
+        if truth.frames > body.frames:
+            raise MeshError(f"{path}: {truth.frames} frames of ground truth, the body has {body.frames}")
+        garments[name] = DemoGarment(garment, truth)
+    return DemoAssets(body, BodyMotion.load(folder / "body.npz"), garments)
+
+
+def run(
+    out: str | Path = "out/demo",
+    *,
+    device: str | None = None,
+    weights: str = "default",
+    frames: int | None = None,
+    moments: int = 8,
+    film: bool = True,
+    folder: str | Path | None = None,
+    progress: bool = False,
+) -> dict[str, GarmentMotion]:
+    """Rolls out, writes everything to `out`, prints the table.
+
+    Args:
+        out: Folder for dress.usd, dress.pc2 with dress.obj, the same of the T-shirt, rollout.png and demo.mp4.
+        device: "cpu" or "cuda"; None takes CUDA where there is any.
+        weights: As `Simulator.from_pretrained`.
+        frames: Only so many.
+        moments: Columns of rollout.png.
+        film: Whether to draw demo.mp4.
+        folder: Other assets.
+        progress: Show progress bars.
+
+    Returns:
+        The garments' motions by name.
+    """
+    from .simulator import Simulator
+
+    began = time.perf_counter()
+    out, bundle = Path(out), assets(folder)
+    simulator = Simulator.from_pretrained(weights, device=device)
+    simulator.timings.synchronise = True
+    print(f"demo on {simulator.device}, network {weights!r}")
+    motions, timings, errors = {}, {}, {}
+    for name, item in bundle.garments.items():
+        first = item.first_vertices
+        simulator.rollout(
+            item.garment, bundle.collider, first_vertices=first, frames=3
+        )  # compiles what is not compiled
+        simulator.timings.clear()
+        count = min(frames or item.truth.frames, item.truth.frames)
+        motions[name] = motion = simulator.rollout(
+            item.garment, bundle.collider, first_vertices=first, frames=count, progress=progress
+        )
+        timings[name] = dict(simulator.timings)
+        finite = int(np.isfinite(motion.vertices).all((1, 2)).sum())
+        errors[name] = float(metrics.mean_vertex_error(motion.vertices[:finite], item.truth.vertices[:finite]))
+    for name, motion in motions.items():
+        body = _until(bundle.body, motion.frames)
+        write_usd(
+            out / f"{name}.usd", [(name, motion.vertices, motion.faces), ("body", body.vertices, body.faces)], body.fps
+        )
+        motion.save(out / f"{name}.pc2")
+    body = _until(bundle.body, min(motion.frames for motion in motions.values()))
+    truth = [bundle.garments[name].truth for name in motions]
+    brush = str(simulator.device)
+    draw.contact_sheet(out / "rollout.png", body, list(motions.values()), truth, frames=moments, device=brush)
+    if film:
+        # on a CPU every second picture: drawing them all would take longer than simulating them
+        step = 2 if simulator.device.type == "cpu" else 1
+        pictures = _film(body, list(motions.values()), truth, range(0, body.frames, step), brush)
+        draw.write_mp4(out / "demo.mp4", pictures, body.fps / step)
+    print(rollout_table(motions, timings, errors))
+    print(f"\nwrote {', '.join(sorted(p.name for p in out.iterdir()))} to {out} in {time.perf_counter() - began:.0f} s")
+    return motions
+
+
+def _until(body: BodyMotion, frames: int) -> BodyMotion:
+    return BodyMotion(body.vertices[:frames], body.faces, body.fps)
+
+
+def _film(
+    body: BodyMotion, motions: Sequence[GarmentMotion], truth: Sequence[GarmentMotion], frames: range, device: str
+) -> Iterator[np.ndarray]:
+    """Each garment by the network and by physics, side by side."""
+    size = (240, 400)
+    camera = draw.chase([body, *truth], size=size)
+    panels, labels = [], []
+    for motion, reference, color in zip(motions, truth, draw.PALETTE, strict=False):
+        for shown, tint, label in ((motion, color, "network"), (reference, draw.SLATE, "physics")):
+            panels.append(
+                draw.film(body, [shown], size=size, colors=[tint], frames=frames, camera=camera, device=device)
+            )
+            labels.append(f"{motion.name}, {label}")
+    for pictures in zip(*panels, strict=True):
+        yield np.concatenate([draw.titled(p, label) for p, label in zip(pictures, labels, strict=True)], axis=1)

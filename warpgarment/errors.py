@@ -1,0 +1,24 @@
+"""The errors a user can cause and act on."""
+
+from __future__ import annotations
+
+
+class MeshError(ValueError):
+    """Bad geometry: names the element, how many there are, and what to do."""
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be read, is damaged, or belongs to another version."""
+
+
+class MissingExtra(ImportError):
+    """An optional package is not installed.
+
+    Args:
+        extra: The extra of this package that brings it, such as ``usd``.
+        purpose: What needs it, as the start of a sentence.
+    """
+
+    def __init__(self, extra: str, purpose: str = "This"):
+        self.extra = extra
+        super().__init__(f'{purpose} needs an optional package: pip install "warpgarment[{extra}]"')

@@ -1,0 +1,333 @@
+"""The manifold-aware transformer (section 4.3; supplement, section 4).
+
+    face features [N, H*34]  -> linear -> N tokens --+                       +-> linear -> Psi (9), Sigma (3) per face
+                                                     +-> encoder layers -----+
+    velocities [C, (H-1)*3]  -> linear -> C tokens --+   (attention.py)      +-> linear -> q (3) per component
+
+History is oldest first: feature k of frame h is number h*34 + k, and h = H-1 is the newest. There is no positional
+encoding: where a face lies is among its features. Inputs and outputs are normalised inside, with statistics that are
+buffers and travel with the weights. What Psi, Sigma and q mean is in `parametrisation.py`; `heading.py` says what
+`heading="canonical"` does. `forward` does everything; training takes it apart:
+
+    features, velocities, frame = network.canonicalise(features, velocities, face_mask)
+    x, v = network.encode(features, velocities)                                    # noise may be added here
+    normalised = network.forward_normalised(x, v, weights, ...)                    # losses may be taken here, against
+    target = network.normalise_targets(rotate_output(target, frame))               #   this
+    output = rotate_output(network.denormalise(normalised), frame, inverse=True)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from warpgarment import heading as _heading
+from warpgarment.attention import ACTIVATIONS, EncoderLayer
+from warpgarment.kernels.features import FEATURES
+from warpgarment.parametrisation import NetworkOutput
+
+STATISTICS = {  # buffers of the normalisation and their lengths
+    "feature_mean": FEATURES,
+    "feature_std": FEATURES,
+    "velocity_mean": 3,
+    "velocity_std": 3,
+    "psi_mean": 9,
+    "psi_std": 9,
+    "singular_value_mean": 3,
+    "singular_value_std": 3,
+    "q_mean": 3,
+    "q_std": 3,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Everything that is not a weight. The defaults are the paper's."""
+
+    embedding: int = 512
+    layers: int = 8
+    feed_forward: int = 512
+    heads: int = 8
+    manifold_heads: int = 2
+    dropout: float = 0.1
+    history: int = 10  # frames
+    geodesic_power: float = 20.0
+    geodesic_radius: float = 1.0  # metres
+    residual: bool = False  # see parametrisation.py
+    heading: str = "world"  # or "canonical", see heading.py
+    norm_first: bool = False
+    activation: str = "relu"  # or "gelu"
+    fps: float = 30.0  # of the motions it was trained on
+
+    def __post_init__(self) -> None:
+        for name in ("embedding", "layers", "feed_forward", "heads"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.embedding % self.heads:
+            raise ValueError(f"heads must divide embedding, got {self.heads} heads for embedding {self.embedding}")
+        if not 0 <= self.manifold_heads <= self.heads:
+            raise ValueError(f"manifold_heads must lie between 0 and heads={self.heads}, got {self.manifold_heads}")
+        if self.history < 2:
+            raise ValueError(f"history must be at least 2 frames, since velocities need two, got {self.history}")
+        if not 0.0 <= self.dropout < 1.0:
+            raise ValueError(f"dropout must lie in [0, 1), got {self.dropout}")
+        for name in ("geodesic_power", "geodesic_radius", "fps"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if self.heading not in ("world", "canonical"):
+            raise ValueError(f'heading must be "world" or "canonical", got {self.heading!r}')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
+
+    @classmethod
+    def base(cls, **changes: object) -> NetworkConfig:
+        """The paper's network, 12.8 million parameters."""
+        return cls(**changes)
+
+    @classmethod
+    def small(cls, **changes: object) -> NetworkConfig:
+        """A network for one CPU core, 0.5 million parameters."""
+        settings: dict[str, object] = {
+            "embedding": 128,
+            "layers": 4,
+            "feed_forward": 192,
+            "heads": 4,
+            "manifold_heads": 1,
+            "residual": True,
+            "heading": "canonical",
+            "norm_first": True,
+            "activation": "gelu",
+        }
+        return cls(**(settings | changes))
+
+
+class NormalisedOutput(NamedTuple):
+    """Output of the network, or a target for it, in units of zero mean and unit variance."""
+
+    psi: torch.Tensor  # [B,N,9]
+    singular_values: torch.Tensor  # [B,N,3]
+    velocity: torch.Tensor  # [B,C,3]
+
+
+def geodesic_weights(distances: torch.Tensor, radius: float, power: float) -> torch.Tensor:
+    """Attention weights of the manifold heads, softmax(-(D/r)^p) along rows (equation 1).
+
+    Args:
+        distances: Geodesic distances between face centroids [m], shape [...,N,N]; inf where there is no way.
+        radius: r [m]. A large power makes the weights a ball of this radius, a small one a smooth decay.
+        power: p.
+
+    Returns:
+        Shape [...,N,N], finite. Rows sum to one; a row whose distances are all inf (a padded one) is zero.
+    """
+    score = -((distances / radius) ** power)  # may overflow to -inf, which is weight 0 and right
+    score = torch.where(torch.isinf(distances), -math.inf, score)  # inf ** power is 1 for a power that rounds to 0
+    highest = score.amax(dim=-1, keepdim=True)
+    weight = torch.exp(score - torch.where(torch.isinf(highest), 0.0, highest))
+    return weight / weight.sum(dim=-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
+
+
+def rotate_output(output: NetworkOutput, frame: torch.Tensor | None, *, inverse: bool = False) -> NetworkOutput:
+    """Output (or target) turned into the frame of `canonicalise`, or back out of it; unchanged where `frame` is None.
+
+    Args:
+        output: In physical units, shapes as in `NetworkOutput` with a batch in front.
+        frame: Rotation per garment, shape [B,3,3].
+        inverse: From the canonical frame to the world.
+    """
+    if frame is None:
+        return output
+    turn = frame.mT if inverse else frame
+    return NetworkOutput(
+        _heading.rotate_matrices(output.psi, turn),
+        output.singular_values,
+        _heading.rotate_vectors(output.velocity, turn),
+    )
+
+
+class ManifoldAwareTransformer(nn.Module):
+    """Predicts how each face deforms in the next frame.
+
+    A residual network (`config.residual`) starts with zero output weights and statistics whose means are identity and
+    zero: untrained, it moves the garment like skin. Keep those means when setting statistics; `set_statistics` checks.
+
+    Args:
+        config: Its shape and settings; `NetworkConfig.base()` and `.small()` are the named ones.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.embed_faces = nn.Linear(config.history * FEATURES, config.embedding)
+        self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
+        self.layers = nn.ModuleList(
+            EncoderLayer(
+                config.embedding,
+                config.feed_forward,
+                config.heads,
+                config.manifold_heads,
+                dropout=config.dropout,
+                norm_first=config.norm_first,
+                activation=config.activation,
+            )
+            for _ in range(config.layers)
+        )
+        self.final_norm = nn.LayerNorm(config.embedding) if config.norm_first else nn.Identity()
+        self.face_head = nn.Linear(config.embedding, 12)
+        self.velocity_head = nn.Linear(config.embedding, 3)
+        for name, length in STATISTICS.items():
+            start = torch.zeros(length) if name.endswith("_mean") else torch.ones(length)
+            self.register_buffer(name, start)
+        self.psi_mean.copy_(torch.eye(3).flatten())
+        if config.residual:
+            for head in (self.face_head, self.velocity_head):
+                nn.init.zeros_(head.weight)
+                nn.init.zeros_(head.bias)
+        else:
+            self.singular_value_mean.fill_(1.0)
+
+    def forward(
+        self,
+        face_features: torch.Tensor,
+        velocities: torch.Tensor,
+        geodesic_weights: torch.Tensor,
+        *,
+        face_mask: torch.Tensor | None = None,
+        velocity_mask: torch.Tensor | None = None,
+    ) -> NetworkOutput:
+        """Physical units and world space in and out.
+
+        Args:
+            face_features: Stacked features, oldest first, shape [B,N,H*34].
+            velocities: Past velocities of each component [m/frame], oldest first, shape [B,C,(H-1)*3].
+            geodesic_weights: From the function of that name, shape [B,N,N], or [1,N,N] for a batch of one garment
+                many times; zero in padded columns.
+            face_mask: True where a face is real, shape [B,N]; None where all are.
+            velocity_mask: True where a component is real, shape [B,C]; None where all are.
+
+        Returns:
+            To be read by `parametrisation.compose`. Entries of padding mean nothing, and are finite.
+        """
+        kind = face_features.device.type
+        half = torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False):  # half precision is for the transformer, not for positions
+            face_features, velocities, frame = self.canonicalise(face_features, velocities, face_mask)
+            x, v = self.encode(face_features, velocities)
+        with torch.autocast(kind, dtype=torch.get_autocast_dtype(kind), enabled=half):
+            normalised = self.forward_normalised(
+                x, v, geodesic_weights, face_mask=face_mask, velocity_mask=velocity_mask
+            )
+        with torch.autocast(kind, enabled=False):
+            return rotate_output(self.denormalise(normalised), frame, inverse=True)
+
+    def canonicalise(
+        self, face_features: torch.Tensor, velocities: torch.Tensor, face_mask: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Turns inputs to the heading the network knows; a network with heading "world" leaves them as they are.
+
+        Returns:
+            Features, velocities, and the rotation [B,3,3] that was applied (None for "world"), for `rotate_output`.
+        """
+        if self.config.heading == "world":
+            return face_features, velocities, None
+        frame = _heading.canonical_frame(face_features, face_mask)
+        turned = _heading.rotate_features(face_features, frame)
+        return turned, _heading.rotate_vectors(velocities, frame), frame
+
+    def encode(self, face_features: torch.Tensor, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Normalises (canonical) inputs; the same statistics serve all frames of the history."""
+        x = (face_features.unflatten(-1, (-1, FEATURES)) - self.feature_mean) / self.feature_std
+        v = (velocities.unflatten(-1, (-1, 3)) - self.velocity_mean) / self.velocity_std
+        return x.flatten(-2), v.flatten(-2)
+
+    def forward_normalised(
+        self,
+        x: torch.Tensor,
+        v: torch.Tensor,
+        geodesic_weights: torch.Tensor,
+        *,
+        face_mask: torch.Tensor | None = None,
+        velocity_mask: torch.Tensor | None = None,
+    ) -> NormalisedOutput:
+        """The transformer itself: normalised inputs to normalised outputs, shapes as in `forward`."""
+        key_mask = None
+        if face_mask is not None or velocity_mask is not None:
+            if face_mask is None:
+                face_mask = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
+            if velocity_mask is None:
+                velocity_mask = torch.ones(v.shape[:2], dtype=torch.bool, device=x.device)
+            x = torch.where(face_mask[..., None], x, 0.0)  # whatever padding holds, NaN too, must not spread
+            v = torch.where(velocity_mask[..., None], v, 0.0)
+            key_mask = torch.cat([face_mask, velocity_mask], dim=1)[:, None, None, :]
+        faces = x.shape[1]
+        tokens = torch.cat([self.embed_faces(x), self.embed_velocity(v)], dim=1)
+        weights = geodesic_weights.to(tokens.dtype)  # once, instead of in every layer where autocast runs in half
+        for layer in self.layers:
+            tokens = layer(tokens, weights, key_mask)
+        tokens = self.final_norm(tokens)
+        psi, singular_values = self.face_head(tokens[:, :faces]).split([9, 3], dim=-1)
+        return NormalisedOutput(psi, singular_values, self.velocity_head(tokens[:, faces:]))
+
+    def denormalise(self, normalised: NormalisedOutput) -> NetworkOutput:
+        """Normalised output to physical units (still in the canonical frame), in the precision of the statistics."""
+        psi = normalised.psi * self.psi_std + self.psi_mean
+        singular_values = normalised.singular_values * self.singular_value_std + self.singular_value_mean
+        velocity = normalised.velocity * self.q_std + self.q_mean
+        return NetworkOutput(psi.unflatten(-1, (3, 3)), singular_values, velocity)
+
+    def normalise_targets(self, output: NetworkOutput) -> NormalisedOutput:
+        """The inverse of `denormalise`."""
+        psi = (output.psi.flatten(-2) - self.psi_mean) / self.psi_std
+        singular_values = (output.singular_values - self.singular_value_mean) / self.singular_value_std
+        return NormalisedOutput(psi, singular_values, (output.velocity - self.q_mean) / self.q_std)
+
+    def set_statistics(self, statistics: Mapping[str, torch.Tensor]) -> None:
+        """Replaces statistics of the normalisation.
+
+        Args:
+            statistics: Any of `STATISTICS`, with its length. Inputs in the canonical frame, targets as
+                `parametrisation.targets` gives them, also in the canonical frame.
+
+        Raises:
+            ValueError: An unknown name, a wrong length, a value that is not finite, a deviation that is not positive,
+                or an output mean of a residual network that is not "moves like skin".
+        """
+        for name, value in statistics.items():
+            if name not in STATISTICS:
+                raise ValueError(f"unknown statistic {name!r}; there are {', '.join(STATISTICS)}")
+            value = torch.as_tensor(value, dtype=torch.float32)
+            if tuple(value.shape) != (STATISTICS[name],):
+                raise ValueError(f"{name} must have shape [{STATISTICS[name]}], got {list(value.shape)}")
+            if not torch.isfinite(value).all():
+                raise ValueError(f"{name} is not finite")
+            if name.endswith("_std") and (value <= 0.0).any():
+                raise ValueError(f"{name} must be positive, smallest is {value.min().item():g}")
+            if self.config.residual and name in ("psi_mean", "singular_value_mean", "q_mean"):
+                skin = torch.eye(3).flatten() if name == "psi_mean" else torch.zeros(3)
+                if not torch.equal(value.cpu(), skin):
+                    raise ValueError(f"{name} of a residual network stays {skin.tolist()}, so that zero means skin")
+        for name, value in statistics.items():
+            getattr(self, name).copy_(torch.as_tensor(value, dtype=torch.float32))
+
+    def parameter_count(self) -> int:
+        """Number of trainable parameters."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    def save(self, path: str | os.PathLike[str], *, dtype: torch.dtype | None = None) -> None:
+        """Writes a checkpoint; see `checkpoint.save`."""
+        from warpgarment import checkpoint
+
+        checkpoint.save(self, path, dtype=dtype)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], device: torch.device | str | None = None) -> ManifoldAwareTransformer:
+        """Reads a checkpoint; see `checkpoint.load`."""
+        from warpgarment import checkpoint
+
+        return checkpoint.load(path, device=device)

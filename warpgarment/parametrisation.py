@@ -1,0 +1,129 @@
+"""What the network's numbers stand for: the map between its output and the step (Psi, Sigma, q) of section 4.1.
+
+The network's setting `residual` chooses one of two, and both can express every step:
+
+    False (the paper)    Psi, Sigma and q are the output
+    True                 Psi   = Psi_out R_i            R_i  rotation of the deformation of face i's nearest body face
+                         Sigma = Sigma_out + Sigma_i^t   Sigma_i^t  singular values of the newest frame
+                         q     = q_out + u_c             u_c  mean velocity of the body faces nearest to component c
+
+So a residual output of (identity, 0, 0), which is what an untrained residual network gives, means "moves like skin".
+
+`compose` and `targets` are inverses of each other, and work on padded [B,N,...] and packed [F,...] arrays alike.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from warpgarment.kernels.deformation import rotation
+from warpgarment.kernels.features import FEATURES, LAYOUT
+
+
+class NetworkOutput(NamedTuple):
+    """Output of the network in physical units, as its parametrisation means it; or the training target for it."""
+
+    psi: torch.Tensor  # [..., N,3,3]
+    singular_values: torch.Tensor  # [..., N,3]
+    velocity: torch.Tensor  # [..., C,3] metres per frame
+
+
+class Step(NamedTuple):
+    """What happens from frame t to t+1, whatever the parametrisation."""
+
+    psi: torch.Tensor  # relative deformation gradient, [..., N,3,3]
+    singular_values: torch.Tensor  # of the next deformation gradient, [..., N,3]
+    velocity: torch.Tensor  # of each component's mean face centroid, [..., C,3], metres per frame
+
+
+class StepContext(NamedTuple):
+    """What of the newest frame the parametrisation refers to."""
+
+    body_rotation: torch.Tensor  # R_i, [..., N,3,3]
+    singular_values: torch.Tensor  # of the newest frame, [..., N,3]
+    body_velocity: torch.Tensor  # u_c, [..., C,3] metres per frame
+
+
+def component_mean(
+    values: torch.Tensor, face_component: torch.Tensor, count: int, face_mask: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Mean over the faces of each component.
+
+    Args:
+        values: Shape [...,N,K].
+        face_component: Component of each face, integer, shape [...,N].
+        count: Number of components C (at most, in a padded batch).
+        face_mask: True where a face is real, shape [...,N]; None where all are.
+
+    Returns:
+        Shape [...,C,K]; zero for a component without faces.
+    """
+    index = face_component.long()
+    if face_mask is not None:
+        values = torch.where(face_mask[..., None], values, 0.0)
+        index = torch.where(face_mask, index, 0)
+        ones = face_mask.to(values.dtype)
+    else:
+        ones = torch.ones_like(values[..., 0])
+    shape = (*values.shape[:-2], count)
+    sums = values.new_zeros((*shape, values.shape[-1]))
+    sums = sums.scatter_add(-2, index[..., None].expand_as(values), values)
+    faces = values.new_zeros(shape).scatter_add(-1, index, ones)
+    return sums / faces.clamp(min=1.0)[..., None]
+
+
+def context(
+    face_features: torch.Tensor, face_component: torch.Tensor, count: int, face_mask: torch.Tensor | None = None
+) -> StepContext:
+    """Reads the context from the features, whose newest frame holds all of it.
+
+    Args:
+        face_features: Features in world space, shape [...,N,34] or stacked [...,N,H*34] with the newest last.
+        face_component: Component of each face, integer, shape [...,N].
+        count: Number of components C.
+        face_mask: True where a face is real, shape [...,N]; None where all are.
+
+    Returns:
+        No gradient flows through the rotation.
+    """
+    newest = face_features[..., -FEATURES:]
+    deformation = newest[..., LAYOUT["body_deformation"]].detach()
+    if face_mask is not None:  # a padded zero matrix has no rotation
+        deformation = torch.where(face_mask[..., None], deformation, torch.eye(3).to(deformation).flatten())
+    shape = deformation.shape[:-1]
+    body_rotation = rotation(deformation.reshape(-1, 3, 3).contiguous()).reshape(*shape, 3, 3)
+    velocity = component_mean(newest[..., LAYOUT["body_velocity"]], face_component, count, face_mask)
+    return StepContext(body_rotation, newest[..., LAYOUT["singular_values"]], velocity)
+
+
+def compose(output: NetworkOutput, context: StepContext, *, residual: bool) -> Step:
+    """Network output -> step.
+
+    Args:
+        output: In physical units and world space.
+        context: Of the newest frame, in world space.
+        residual: The network's setting.
+
+    Returns:
+        The step. Singular values are as predicted: nothing keeps them positive or sorted here.
+    """
+    if not residual:
+        return Step(*output)
+    return Step(
+        output.psi @ context.body_rotation,
+        output.singular_values + context.singular_values,
+        output.velocity + context.body_velocity,
+    )
+
+
+def targets(step: Step, context: StepContext, *, residual: bool) -> NetworkOutput:
+    """Step -> the network output that means it; the inverse of `compose`, with the same arguments."""
+    if not residual:
+        return NetworkOutput(*step)
+    return NetworkOutput(
+        step.psi @ context.body_rotation.mT,
+        step.singular_values - context.singular_values,
+        step.velocity - context.body_velocity,
+    )

@@ -1,0 +1,61 @@
+"""Pins: garment vertices that stay where they were on the body (waistbands, straps).
+
+In the first frame each pin finds its nearest body face and keeps two things: the barycentric coordinates of the
+nearest point, and the offset from it, written in the face's own orthonormal frame [e1/|e1|, n x e1/|e1|, n] (of which
+the part along the normal n is all, except where the nearest point lies on an edge). In every later frame
+
+    target = sum_k b_k U_k + offset_1 t + offset_2 (n x t) + offset_3 n
+
+so the first frame is reproduced exactly, and what follows comes from the body alone.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from warpgarment.kernels.sdf import BodyMeshes
+
+
+class BodyPins:
+    """Pins tied to the surface of packed bodies.
+
+    Args:
+        positions: Of the pinned vertices in the first frame [m], shape [P,3].
+        bodies: The bodies in that frame.
+        body_of_pin: Body of each pin, int32, shape [P].
+    """
+
+    def __init__(self, positions: torch.Tensor, bodies: BodyMeshes, body_of_pin: torch.Tensor) -> None:
+        query = bodies.query(positions.contiguous(), body_of_pin)
+        self.corners = bodies.faces[query.face.long()].long()  # [P,3]
+        triangles = bodies.vertices[self.corners]
+        self.barycentric = barycentric_coordinates(query.closest, triangles)
+        foot = (self.barycentric[..., None] * triangles).sum(dim=1)
+        self.offset = (_surface_frames(triangles).mT @ (positions - foot)[..., None]).squeeze(-1)
+
+    def targets(self, body_vertices: torch.Tensor) -> torch.Tensor:
+        """Where the pins are when the bodies are there; [U,3] -> [P,3] in metres."""
+        triangles = body_vertices[self.corners]
+        foot = (self.barycentric[..., None] * triangles).sum(dim=1)
+        return foot + (_surface_frames(triangles) @ self.offset[..., None]).squeeze(-1)
+
+
+def barycentric_coordinates(points: torch.Tensor, triangles: torch.Tensor) -> torch.Tensor:
+    """Barycentric coordinates of points on triangles; [P,3], [P,3,3] (corner, axis) -> [P,3], summing to one.
+
+    By areas, u_k = n . ((V_k+1 - p) x (V_k+2 - p)) / n . n, which needs no solve.
+    """
+    a, b, c = triangles.unbind(dim=1)
+    normal = torch.linalg.cross(b - a, c - a)
+    area = (normal * normal).sum(dim=-1).clamp(min=torch.finfo(points.dtype).tiny)
+    u = (torch.linalg.cross(b - points, c - points) * normal).sum(dim=-1) / area
+    v = (torch.linalg.cross(c - points, a - points) * normal).sum(dim=-1) / area
+    return torch.stack([u, v, 1.0 - u - v], dim=-1)
+
+
+def _surface_frames(triangles: torch.Tensor) -> torch.Tensor:
+    """Orthonormal frames [tangent, bitangent, normal] as columns; [P,3,3] (corner, axis) -> [P,3,3]."""
+    edge1, edge2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    tangent = torch.nn.functional.normalize(edge1, dim=-1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(edge1, edge2), dim=-1)
+    return torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], dim=-1)

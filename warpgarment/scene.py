@@ -1,0 +1,234 @@
+"""One batch of garments on bodies: what stays the same during a simulation, and the geometry around the network.
+
+The stages of Algorithm 1, all on packed arrays: `features` before the network, `reconstruct` (singular values, Poisson)
+and `push_out` (collisions) after it. A scene holds no garment positions; those are in `simulator.SimulationState`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+
+from warpgarment.batch import PackedBodies, PackedGarments, padded_views
+from warpgarment.errors import MeshError
+from warpgarment.garment import Garment
+from warpgarment.kernels.collision import CollisionSolver
+from warpgarment.kernels.deformation import face_centroids, inverse_rest_frames, replace_singular_values, segment_mean
+from warpgarment.kernels.features import LAYOUT, BodyInteraction, body_interaction, face_features
+from warpgarment.kernels.poisson import PoissonSolver
+from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.network import ManifoldAwareTransformer, NetworkOutput
+from warpgarment.parametrisation import Step, compose, context
+from warpgarment.pins import BodyPins
+from warpgarment.timing import Timings
+
+FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
+SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this
+SHALLOW = 1e-3  # metres: collisions are repeated while a vertex is deeper
+WORTHWHILE = 0.9  # ... and while a pass leaves at most this share of the depth before it
+
+
+class Scene:
+    """Garments, bodies, solvers and the network's view of them.
+
+    Args:
+        garments: In the order of the batch.
+        bodies: Topology of the bodies, and which garment is on which.
+        body_vertices: Bodies in the first frame [m], packed, shape [U,3].
+        first_vertices: Garments in the first frame [m], packed, shape [V,3].
+        network: Reads its config; run by `predict`.
+        face_splits: As `padded_views`.
+        epsilon: Distance that collision refinement keeps from the body [m].
+        collision_passes: At most so many refinements a frame.
+        half: Whether the transformer runs in bfloat16.
+        timings: Where the stages write how long they took.
+
+    Raises:
+        MeshError: A garment is more than 1 m from its body.
+    """
+
+    def __init__(
+        self,
+        garments: Sequence[Garment],
+        bodies: PackedBodies,
+        body_vertices: torch.Tensor,
+        first_vertices: torch.Tensor,
+        network: ManifoldAwareTransformer,
+        *,
+        face_splits: int,
+        epsilon: float,
+        collision_passes: int,
+        half: bool,
+        timings: Timings,
+    ) -> None:
+        device = body_vertices.device
+        self.garments, self.network, self.timings = list(garments), network, timings
+        self.epsilon, self.collision_passes, self.half = epsilon, collision_passes, half
+        self.packed = packed = PackedGarments.pack(garments, device)
+        self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
+
+        self.body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
+        self.body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
+        self._bodies = BodyMeshes(body_vertices, bodies.faces, bodies.vertex_offsets, bodies.face_offsets)
+        self._placed = body_vertices
+        self.refuse_far(first_vertices)
+
+        self.views = padded_views(packed, garments, network.config, face_splits)
+        pinned = len(packed.pins) > 0
+        self.poisson = PoissonSolver(packed.rest_vertices, packed.faces, pins=packed.pins if pinned else None)
+        self.collision = CollisionSolver(packed.rest_vertices, packed.faces)
+        self.pins = None
+        if pinned:
+            body_of_pin = bodies.body_of_garment[packed.garment_of_pin.long()]
+            self.pins = BodyPins(first_vertices[packed.pins.long()], self._bodies, body_of_pin)
+
+    def bodies(self, body_vertices: torch.Tensor) -> BodyMeshes:
+        """The bodies' meshes with these vertices; moves them there if the last caller had them elsewhere."""
+        if self._placed is not body_vertices:
+            self._bodies.update(body_vertices)
+            self._placed = body_vertices
+        return self._bodies
+
+    def refuse_far(self, vertices: torch.Tensor) -> None:
+        """Raises MeshError for a garment that is nowhere near its body."""
+        distance = self._bodies.query(vertices, self.body_of_vertex).distance
+        for number, mine in enumerate(distance.split(_lengths(self.packed.vertex_offsets))):
+            nearest = mine.abs().min().item()
+            if nearest > FARTHEST:
+                name = self.garments[number].name or f"number {number}"
+                raise MeshError(
+                    f"garment {name} is {nearest:.2f} m from its body at the nearest vertex. Check that both are in "
+                    "metres (Garment.load(..., unit=...)) and Y up, and bring the garment onto the first frame with "
+                    "wg.fit."
+                )
+
+    def components_mean(self, vertices: torch.Tensor) -> torch.Tensor:
+        """Mean face centroid of each component (z of the paper) [m], [V,3] -> [C,3]."""
+        centroids = face_centroids(vertices, self.packed.faces)
+        return segment_mean(centroids, self.packed.face_component, self.packed.component_count)
+
+    def features(self, vertices: torch.Tensor, body_vertices: torch.Tensor, next_body: torch.Tensor) -> torch.Tensor:
+        """Features of a frame, step 1: garments [V,3] on bodies [U,3] that will be at `next_body` [U,3] -> [F,34]."""
+        packed = self.packed
+        with self.timings("signed distance"):
+            centroids = face_centroids(vertices, packed.faces)
+            bodies = self.bodies(body_vertices)
+            interaction: BodyInteraction = body_interaction(centroids, self.body_of_face, bodies, next_body)
+        with self.timings("features"):
+            mean = segment_mean(centroids, packed.garment_of_face, packed.count)
+            return face_features(self.inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, interaction)
+
+    def predict(self, stacked: torch.Tensor, velocities: torch.Tensor) -> Step:
+        """The network, step 2: stacked features [F,H,34] and velocities [C,H-1,3] -> what happens next."""
+        faces, components = len(stacked), len(velocities)
+        stacked, velocities = stacked.flatten(1), velocities.flatten(1)
+        output = NetworkOutput(
+            stacked.new_empty((faces, 3, 3)), stacked.new_empty((faces, 3)), stacked.new_zeros((components, 3))
+        )
+        training = self.network.training
+        self.network.eval()
+        device = stacked.device.type
+        with self.timings("network"), torch.autocast(device, torch.bfloat16, enabled=self.half):
+            for view in self.views:
+                rows = self.network(
+                    view.faces(stacked),
+                    view.components(velocities),
+                    view.weights,
+                    face_mask=view.face_mask,
+                    velocity_mask=view.component_mask,
+                )
+                view.add_to(output, rows)
+        self.network.train(training)
+        newest = context(stacked, self.packed.face_component, components)
+        return compose(output, newest, residual=self.network.config.residual)
+
+    def reconstruct(
+        self, vertices: torch.Tensor, step: Step, features: torch.Tensor, next_body: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Steps 3 and 4: the predicted deformation gradients become positions.
+
+        Args:
+            vertices: Of the newest frame [m], shape [V,3].
+            step: Prediction.
+            features: Of the newest frame, shape [F,34].
+            next_body: Bodies in the next frame, shape [U,3].
+
+        Returns:
+            Positions [V,3], and which garments are finite [B]; the others are where they were.
+        """
+        packed = self.packed
+        with self.timings("singular values"):
+            phi = features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3)
+            sound = torch.isfinite(step.psi).flatten(1).all(1) & torch.isfinite(step.singular_values).all(1)
+            sound &= torch.isfinite(step.velocity).all(1)[packed.face_component.long()]
+            finite = self.all_of(sound, packed.garment_of_face)
+            kept = finite[packed.garment_of_face.long()]  # NaN of one garment must not reach a solver
+            psi = torch.where(kept[:, None, None], step.psi, torch.eye(3).to(phi))
+            stretch = torch.where(kept[:, None], step.singular_values, 1.0).clamp(min=SMALLEST_SINGULAR_VALUE)
+            target = replace_singular_values((psi @ phi).contiguous(), stretch)
+        with self.timings("poisson"):
+            velocity = torch.nan_to_num(step.velocity, 0.0, 0.0, 0.0)
+            solved = self.poisson.solve(
+                target,
+                self.components_mean(vertices) + velocity,
+                initial=vertices + velocity[packed.vertex_component.long()],
+                pin_targets=None if self.pins is None else self.pins.targets(next_body),
+            )
+        return self.keep_finite(solved, vertices, finite)
+
+    def push_out(
+        self, vertices: torch.Tensor, next_body: torch.Tensor, finite: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:
+        """Step 5: refines collisions, again for garments that are still deep and while it helps them.
+
+        Args:
+            vertices: Positions [m], shape [V,3].
+            next_body: Bodies in the next frame, shape [U,3].
+            finite: Which garments are still simulated, shape [B].
+
+        Returns:
+            Positions [V,3], finite [B], depth of each garment's deepest vertex [m] [B], and iterations of all passes.
+        """
+        with self.timings("collision"):
+            bodies = self.bodies(next_body)
+            pending, depth, iterations = finite.clone(), None, 0
+            for _ in range(self.collision_passes):
+                refined = self.collision.refine(vertices, bodies, self.body_of_vertex, epsilon=self.epsilon)
+                iterations += self.collision.iterations
+                mine = pending[self.packed.garment_of_vertex.long()]
+                refined = torch.where(mine[:, None], refined, vertices)
+                vertices, finite = self.keep_finite(refined, vertices, finite)
+                before, depth = depth, self.depth(vertices, bodies)
+                pending = finite & (depth > SHALLOW)
+                if before is not None:
+                    pending &= depth < WORTHWHILE * before
+                if not pending.any():
+                    break
+            if depth is None:
+                depth = self.depth(vertices, bodies)
+        return vertices, finite, depth, iterations
+
+    def depth(self, vertices: torch.Tensor, bodies: BodyMeshes) -> torch.Tensor:
+        """How deep the deepest vertex of each garment is in its body [m], at least 0; shape [B]."""
+        inside = -bodies.query(vertices, self.body_of_vertex).distance
+        index = self.packed.garment_of_vertex.long()
+        return inside.new_zeros(self.packed.count).scatter_reduce(0, index, inside, "amax")
+
+    def keep_finite(
+        self, new: torch.Tensor, old: torch.Tensor, finite: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """New positions where a garment's are all finite, else its old ones; and which garments are finite."""
+        index = self.packed.garment_of_vertex
+        finite = finite & self.all_of(torch.isfinite(new).all(1), index)
+        return torch.where(finite[index.long()][:, None], new, old), finite
+
+    def all_of(self, flags: torch.Tensor, garment: torch.Tensor) -> torch.Tensor:
+        """Whether a flag holds for all elements of a garment; [N] and owner [N] -> [B]."""
+        wrong = torch.zeros(self.packed.count, dtype=torch.int32, device=flags.device)
+        return wrong.index_add(0, garment.long(), (~flags).int()) == 0
+
+
+def _lengths(offsets: Sequence[int]) -> list[int]:
+    return [after - before for before, after in itertools.pairwise(offsets)]

@@ -1,0 +1,305 @@
+"""The simulator: garments on moving bodies, frame by frame (Algorithm 1).
+
+`rollout` takes whole motions, `start` and `step` take bodies as they come; both run the same code on a packed batch,
+and one garment is a batch of one.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgarment import checkpoint
+from warpgarment.arguments import as_array, known_frames, listed, per_garment
+from warpgarment.batch import PackedBodies
+from warpgarment.body import BodyMotion
+from warpgarment.errors import MeshError
+from warpgarment.garment import Garment
+from warpgarment.history import History
+from warpgarment.motion import GarmentMotion
+from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.scene import Scene
+from warpgarment.state import SimulationState
+from warpgarment.status import RolloutStatus
+from warpgarment.timing import Timings
+
+
+class Simulator:
+    """Moves garments with a network.
+
+    Args:
+        network: Moved to the device, and used in evaluation mode whatever mode it is in.
+        device: "cpu", "cuda", ...; None takes CUDA where there is any.
+        epsilon: Distance that collision refinement keeps between vertices and body [m].
+        collision_passes: Collision refinement is repeated while a vertex is more than 1 mm deep and it helps, at most
+            so often per frame; 0 leaves it out.
+        half: Run the transformer in bfloat16: faster on recent GPUs. Geometry stays in float32.
+
+    Attributes:
+        timings: Seconds per stage since the simulator was made: a dict, plus `synchronise`, which must be set for it to
+            be filled on CUDA.
+    """
+
+    def __init__(
+        self,
+        network: ManifoldAwareTransformer,
+        device: torch.device | str | None = None,
+        *,
+        epsilon: float = 0.004,
+        collision_passes: int = 4,
+        half: bool = False,
+    ) -> None:
+        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device("cuda", torch.cuda.current_device())
+        if not epsilon >= 0.0 or collision_passes < 0:
+            raise ValueError(f"epsilon and collision_passes must not be negative, got {epsilon} and {collision_passes}")
+        self.network = network.to(self.device)
+        self.epsilon, self.collision_passes, self.half = float(epsilon), int(collision_passes), half
+        self.timings = Timings(self.device)
+
+    @classmethod
+    def from_pretrained(
+        cls, name: str | os.PathLike[str] = "default", device: torch.device | str | None = None, **options: Any
+    ) -> Simulator:
+        """A simulator with a trained network.
+
+        Args:
+            name: "default", the name of a network that ships, a checkpoint file, or a folder that holds one.
+            device: As in the constructor, and so are the options.
+
+        Raises:
+            CheckpointError: There is no such network, or its file is damaged.
+        """
+        return cls(checkpoint.load(checkpoint.find(name)), device, **options)
+
+    def rollout(
+        self,
+        garment: Garment | Sequence[Garment],
+        body: BodyMotion | Sequence[BodyMotion],
+        *,
+        first_vertices: Any = None,
+        history: Any = None,
+        frames: int | None = None,
+        face_splits: int = 1,
+        progress: bool = False,
+    ) -> Any:
+        """Simulates garments over motions of their bodies, as one batch.
+
+        Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
+        network's rate. Garments whose motion is shorter stop earlier; one that stops being finite ends with that frame,
+        which holds NaN, with a status that says so and a RuntimeWarning.
+
+        Args:
+            garment: One or a list.
+            body: One, on which all garments are, or a list with one for each garment (which may repeat).
+            first_vertices: Positions in the first frame [m], shape [V,3] (or a list), where they differ from the rest
+                positions `garment.vertices`: see `wg.fit`.
+            history: Known first frames, shape [H,V,3] (or a list) with H the network's `history`, of the body's first H
+                frames. They are returned as they are, and the simulation goes on from them.
+            frames: Stop after so many frames, known ones included.
+            face_splits: Show the network so many interleaved subsets of the faces, one at a time: less time and memory.
+            progress: Show a progress bar.
+
+        Returns:
+            A `GarmentMotion` at the network's rate, or a list of them for a list of garments.
+
+        Raises:
+            ValueError: Lists of different lengths, arrays of other shapes, both `first_vertices` and `history`.
+            MeshError: A garment is more than 1 m from its body, or positions are not finite.
+        """
+        garments, single = listed(garment, Garment)
+        bodies = per_garment(body, BodyMotion, len(garments), "bodies")
+        unique = list({id(b): b for b in bodies}.values())
+        number = {id(b): i for i, b in enumerate(unique)}
+        motions = [b.resampled(self.network.config.fps) for b in unique]
+        if frames is not None and frames < 1:
+            raise ValueError(f"frames must be at least 1, got {frames}")
+        known = self._known(garments, single, first_vertices, history)
+        given = known.shape[0]
+        lengths = [min(motions[number[id(b)]].frames, frames or 2**62) for b in bodies]
+        if min(lengths) < given:
+            raise ValueError(f"history has {given} frames, the shortest motion (or frames=) {min(lengths)}")
+
+        def body_at(frame: int) -> torch.Tensor:
+            return self._positions([m.vertices[min(frame, m.frames - 1)] for m in motions])
+
+        packed = PackedBodies.pack(
+            [m.faces for m in motions],
+            [m.vertices.shape[1] for m in motions],
+            [number[id(b)] for b in bodies],
+            self.device,
+        )
+        first = [body_at(frame) for frame in range(given)]
+        states = self._begin(garments, single, packed, known, first, face_splits)
+        total = max(lengths)
+        sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, garments, strict=True)]
+        positions = [np.full(size, np.nan, np.float32) for size in sizes]
+        statuses: list[list[RolloutStatus]] = [[] for _ in garments]
+        for frame in _counted(range(total), progress):
+            if frame < given:
+                state = states[frame]
+            else:
+                state = self._advance(state, body_at(frame))
+            for i, (part, status) in enumerate(zip(state.split(), state.statuses(), strict=True)):
+                failed = statuses[i] and not statuses[i][-1].finite
+                if frame < lengths[i] and not failed:
+                    positions[i][frame] = part
+                    statuses[i].append(status)
+            if not state.finite.any():
+                break
+        results = []
+        for i, garment in enumerate(garments):
+            if not statuses[i][-1].finite:
+                label = garment.name or f"garment {i}"
+                warnings.warn(f"{label} stopped: {statuses[i][-1].message}", RuntimeWarning, stacklevel=2)
+            moved = positions[i][: len(statuses[i])]
+            results.append(GarmentMotion(moved, garment.faces, self.network.config.fps, statuses[i], garment.name))
+        return results[0] if single else results
+
+    def start(
+        self,
+        garment: Garment | Sequence[Garment],
+        body_vertices: Any,
+        body_faces: Any,
+        *,
+        first_vertices: Any = None,
+        face_splits: int = 1,
+    ) -> SimulationState:
+        """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
+
+        Args:
+            garment: One or a list.
+            body_vertices: The body in the first frame [m], shape [U,3]; a list, one for each garment, or one for all.
+            body_faces: Its faces, shape [G,3]; a list where `body_vertices` is one.
+            first_vertices: As in `rollout`.
+            face_splits: As in `rollout`.
+
+        Returns:
+            The state at frame 0.
+
+        Raises:
+            ValueError, MeshError: As `rollout`.
+        """
+        garments, single = listed(garment, Garment)
+        if isinstance(body_vertices, (list, tuple)):
+            if len(body_vertices) != len(garments) or len(body_faces) != len(garments):
+                raise ValueError(
+                    f"{len(garments)} garments, {len(body_vertices)} bodies and {len(body_faces)} arrays of body faces; "
+                    "give one of each per garment, or one body for all"
+                )
+            shapes, faces, on = list(body_vertices), list(body_faces), list(range(len(garments)))
+        else:
+            shapes, faces, on = [body_vertices], [body_faces], [0] * len(garments)
+        checked = [
+            BodyMotion(as_array(v)[None], f, self.network.config.fps) for v, f in zip(shapes, faces, strict=True)
+        ]
+        packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
+        known = self._known(garments, single, first_vertices, None)
+        first = self._positions([b.vertices[0] for b in checked])
+        return self._begin(garments, single, packed, known, [first], face_splits)[0]
+
+    def step(self, state: SimulationState, next_body_vertices: Any) -> SimulationState:
+        """One frame on.
+
+        Args:
+            state: From `start` or `step`; stays as it is.
+            next_body_vertices: The body in the next frame [m], shape [U,3]; a list where `start` was given one. Copied.
+
+        Returns:
+            The next state. Once a garment is not finite it stays so, and its vertices are NaN.
+
+        Raises:
+            ValueError: Another number of bodies or vertices than at the start.
+            MeshError: Positions that are not finite.
+        """
+        listed = isinstance(next_body_vertices, (list, tuple))
+        body = self._positions([as_array(v) for v in (next_body_vertices if listed else [next_body_vertices])])
+        if body.shape != state.body.shape:
+            raise ValueError(f"bodies had {len(state.body)} vertices at the start, now there are {len(body)}")
+        if not torch.isfinite(body).all():
+            raise MeshError(f"body_vertices of frame {state.frame + 1} hold NaN or infinity; skip or repair the frame")
+        return self._advance(state, body)
+
+    @torch.inference_mode()
+    def _begin(
+        self,
+        garments: list[Garment],
+        single: bool,
+        bodies: PackedBodies,
+        known: torch.Tensor,
+        body_frames: list[torch.Tensor],
+        face_splits: int,
+    ) -> list[SimulationState]:
+        """States of the known frames [K,V,3]: one for a cold start, H with a history."""
+        scene = Scene(
+            garments,
+            bodies,
+            body_frames[0],
+            known[0],
+            self.network,
+            face_splits=face_splits,
+            epsilon=self.epsilon,
+            collision_passes=self.collision_passes,
+            half=self.half,
+            timings=self.timings,
+        )
+        history_length = self.network.config.history
+        features = scene.features(known[0], body_frames[0], body_frames[0])
+        history = History.cold(features, scene.packed.component_count, history_length)
+        states = []
+        for frame, (vertices, body) in enumerate(zip(known, body_frames, strict=True)):
+            if frame:
+                features = scene.features(known[frame - 1], body_frames[frame - 1], body)
+                velocity = scene.components_mean(vertices) - scene.components_mean(known[frame - 1])
+                history = history.followed(history.stacked(features), velocity)
+            depth = scene.depth(vertices, scene.bodies(body)).cpu().numpy()
+            finite = np.ones(len(garments), dtype=bool)
+            states.append(SimulationState(scene, single, frame, vertices, body, history, finite, depth, 0, 0))
+        return states
+
+    @torch.inference_mode()
+    def _advance(self, state: SimulationState, next_body: torch.Tensor) -> SimulationState:
+        """Algorithm 1: frame t, and the body at t+1, to frame t+1."""
+        scene, vertices = state.scene, state.positions
+        features = scene.features(vertices, state.body, next_body)
+        stacked = state.history.stacked(features)
+        step = scene.predict(stacked, state.history.velocities)
+        solved, finite = scene.reconstruct(vertices, step, features, next_body)
+        finite = finite & torch.from_numpy(state.finite).to(finite.device)
+        poisson_iterations = scene.poisson.iterations
+        committed, finite, depth, collision_iterations = scene.push_out(solved, next_body, finite)
+        velocity = scene.components_mean(committed) - scene.components_mean(vertices)
+        return SimulationState(
+            scene=scene,
+            single=state.single,
+            frame=state.frame + 1,
+            positions=committed,
+            body=next_body,
+            history=state.history.followed(stacked, velocity),
+            finite=finite.cpu().numpy(),
+            depth=depth.cpu().numpy(),
+            poisson_iterations=poisson_iterations,
+            collision_iterations=collision_iterations,
+        )
+
+    def _known(self, garments: list[Garment], single: bool, first: Any, history: Any) -> torch.Tensor:
+        frames = known_frames(garments, single, first, history, self.network.config.history)
+        return torch.from_numpy(frames).to(self.device)
+
+    def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
+        """Arrays [*,3] end to end on the device; always a copy, so that callers may reuse theirs."""
+        return torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False)).to(self.device)
+
+
+def _counted(frames: range, progress: bool) -> Any:
+    if not progress:
+        return frames
+    from tqdm import tqdm
+
+    return tqdm(frames, desc="rollout", unit="frame")
