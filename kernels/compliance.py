@@ -5,8 +5,8 @@ garment; with its inverse Z, the compliance, the unknowns shrink from three per 
 
     (I + S) y = c,    S_ij = n_i·n_j Z_ij,    D = Z N y
 
-(push-through identity), where y_i = c_i - n_i·D_i is the force of contact i. Conjugate gradients with Jacobi solve it in
-tens of steps where the system for D takes hundreds. Their error in the energy norm bounds that of D:
+(push-through identity), where y_i = c_i - n_i·D_i is the force of contact i. Conjugate gradients with Jacobi solve it
+in tens of steps where the system for D takes hundreds. Their error in the energy norm bounds that of D:
 |δD|_B² = δyᵀ S δy ≤ δyᵀ (I + S) δy. Z is dense, so this is for components of moderate size; the rest go to cg.py.
 
 | symbol | code | what |
@@ -81,7 +81,8 @@ class Compliance(NamedTuple):
             base[c], room[c], needed = known[key], needed, needed + int(size) ** 2
         values = torch.cat(blocks) if blocks else torch.empty(0, dtype=torch.float32, device=device)
         device_side = (torch.from_numpy(a).to(device) for a in (base, room))
-        return cls(*device_side, torch.tensor([needed, (base >= 0).sum(), (base < 0).sum()]), torch.from_numpy(local).to(device), values)
+        counts = torch.tensor([needed, (base >= 0).sum(), (base < 0).sum()])
+        return cls(*device_side, counts, torch.from_numpy(local).to(device), values)
 
 
 @wp.kernel(enable_backward=False)
@@ -113,10 +114,10 @@ def solve_contacts(
     """(I + S) y = c for one component, from zero; stops as `cg.conjugate_gradients` does."""
     component, lane = wp.tid()
     if base[component] >= wp.int64(0):
-        first = int(0)
+        first = wp.int32(0)
         if start[component] > 0:
             first = contact_end[start[component] - 1]
-        count = int(0)
+        count = wp.int32(0)
         if start[component + 1] > start[component]:
             count = contact_end[start[component + 1] - 1] - first
         size = wp.int64(start[component + 1] - start[component])
@@ -125,7 +126,7 @@ def solve_contacts(
         one = wp.float64(1.0)
 
         # S, symmetric: a lone lane walks along its rows, many lanes side by side along its columns.
-        along = int(1)
+        along = wp.int32(1)
         across = count
         if stride > 1:
             along = count
@@ -158,7 +159,7 @@ def solve_contacts(
         window = wp.float64(0.0)
         previous = wp.float64(0.0)
         left = wp.float64(0.0)
-        iteration = int(0)
+        iteration = wp.int32(0)
         running = rz > zero
         while running and iteration < max_iterations:
             pq = wp.float64(0.0)
@@ -245,7 +246,7 @@ def displacement(
     i = wp.tid()
     component = vertex_component[i]
     if base[component] >= wp.int64(0):
-        first = int(0)
+        first = wp.int32(0)
         if start[component] > 0:
             first = contact_end[start[component] - 1]
         size = wp.int64(start[component + 1] - start[component])

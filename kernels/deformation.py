@@ -1,6 +1,6 @@
 """Deformation gradients of triangles: how a face stretches, shears and turns from the rest pose.
 
-Manifold-aware transformers, section 3.1, equations 1-3 (after Sumner and Popović 2004).
+Manifold-aware transformers, supplement 1.1 and 1.2 (after Sumner and Popović 2004).
 
     Q = [e1, e2, n],  e1 = v1 − v0,  e2 = v2 − v0,  n = e1 × e2 / |e1 × e2|
     Φ = Q Q_rest⁻¹,   Ψ = Φ_next Φ⁻¹
@@ -11,7 +11,7 @@ Manifold-aware transformers, section 3.1, equations 1-3 (after Sumner and Popovi
     | Q      | face_frame                    | columns e1, e2 (metres) and the unit normal n |
     | Φ      | deformation_gradient          | against the rest pose                         |
     | Ψ      | relative_deformation_gradient | from one frame to the next                    |
-    | z      | centroid                      | mean of a face's corners                      |
+    | c      | centroid                      | mean of a face's corners                      |
 
 Φ maps unit normals to unit normals, so one of its singular values is always 1. A face without area has no normal: its
 n, and with it one column of Q, is zero. A face that names a vertex which is not there gives NaN and reads nothing.

@@ -1,17 +1,17 @@
 """What the network sees of a face: 34 numbers per face and frame, in one launch; and its nearest body face, in another.
 
-Manifold-aware transformers, section 3.2 and 4.1 (input features).
+Manifold-aware transformers, section 4.2 and, for their order, f_i in section 4.3.
 
-    x_i = (Φ_i, n_i, z_i − z̄, d_i, v̄_i, D_i, q̄_i, Σ_i)
+    f_i = (Φ_i, n_i, c_i − z, d_i, v̄_i, D_i, q̄_i, Σ_i)
 
     | paper | code                 | what                                                              |
     | ----- | -------------------- | ----------------------------------------------------------------- |
     | Φ     | deformation_gradient | against the rest pose, row-major                                  |
     | n     | normal               | unit normal                                                       |
-    | z     | centroid             | of the face, less the garment's mean centroid z̄ [m]              |
+    | c − z | centroid             | of the face, less z, the garment's mean of these [m]              |
     | d     | signed_distance      | of the centroid to the body [m]                                   |
     | v̄     | direction_to_body    | unit vector from the centroid to the nearest body point           |
-    | D     | body_deformation     | of the nearest body face from t to t+1, Q_next Q⁻¹                |
+    | D     | body_deformation     | of the nearest body face from t to t+1, Q_next Q⁻¹ (there: d_i)   |
     | q̄     | body_velocity        | displacement of that face's centroid from t to t+1 [m per frame]  |
     | Σ     | singular_values      | of Φ, descending                                                  |
 """

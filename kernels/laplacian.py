@@ -1,12 +1,12 @@
 """Cotangent Laplacian and connected components of a rest mesh, built once on the host in float64.
 
-Supplement sections 1.3 and 2. With e_k the edge of a triangle opposite to its corner k, A its area and θ_k the angle there:
+Supplement sections 1.3 and 2. With e_k the edge of a triangle opposite to corner k, A its area and θ_k the angle there:
 
     w_k = ½ cot θ_k = -e_i·e_j / (4 A)        (i, j the other two corners)
     L   = Σ_triangles Σ_k w_k (δ_i - δ_j)(δ_i - δ_j)ᵀ
 
-L is symmetric and positive semi-definite (obtuse triangles give negative weights, never negative energy), has no unit, and
-its null space holds one constant per connected component.
+L is symmetric and positive semi-definite (obtuse triangles give negative weights, never negative energy), has no unit,
+and its null space holds one constant per connected component.
 
 | symbol | code | what |
 | --- | --- | --- |

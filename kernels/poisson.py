@@ -5,7 +5,7 @@ Supplement section 1.3, eq. 1, its in-plane part (the part along the normal says
     V* = argmin_V Σ_i s_i ‖(Φ_i(V) - Φ_i) P_i‖²,    P_i = I - n_i n_iᵀ of the rest triangle
 
 With the half cotangents w of the rest mesh this is Σ over the edges (a, b) of every triangle of
-w |(V_a - V_b) - Φ_i (X_a - X_b)|², so that V* solves L V = G(Φ). The solve is for the increment D from a starting guess V⁰,
+w |(V_a - V_b) - Φ_i (X_a - X_b)|², so that V* solves L V = G(Φ). The solve is for the increment D from a guess V⁰,
 
     (L + W) D = g,    g_a = -Σ_edges w ((V⁰_a - V⁰_b) - Φ_i (X_a - X_b)) + W_a (t_a - V⁰_a)
 
@@ -40,8 +40,9 @@ from .laplacian import as_numpy, components, cotangent_laplacian, half_cotangent
 TOLERANCE = 3e-7
 """Error of a solve in the energy norm as a share of the rest bounding box diagonal.
 
-Measured on skirts, sheets with obtuse triangles and narrow strips of 280 to 9,600 faces, from near and far guesses: the worst
-vertex is off by up to 7e-5 of the diagonal at 1e-5, 1.4e-5 at 1e-6, and 2e-6 at 3e-7, for a tenth more iterations than at 1e-5.
+Measured on skirts, sheets with obtuse triangles and narrow strips of 280 to 9,600 faces, from near and far guesses:
+the worst vertex is off by up to 7e-5 of the diagonal at 1e-5, 1.4e-5 at 1e-6, and 2e-6 at 3e-7, for some 15 % more iterations
+than at 1e-5.
 """
 ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
@@ -266,8 +267,8 @@ def poisson_solve(
             ],
             device=device,
         )
-        system = model[_SYSTEM:]
-        increment, report, error = cg.solve(system, tensors["no_normal"], rhs, tensors["tolerance"], 0.0, max_iterations)
+        system, normal, tolerance = model[_SYSTEM:], tensors["no_normal"], tensors["tolerance"]
+        increment, report, error = cg.solve(system, normal, rhs, tolerance, 0.0, max_iterations)
         wp.launch_tiled(
             place,
             dim=[count],

@@ -1,6 +1,6 @@
 """Signed distance from points to a body, differentiable.
 
-Manifold-aware transformers, section 3.2 (s_i) and supplement equations 2-3; sign by generalised winding numbers
+Manifold-aware transformers, section 4.2 (d_i in s_i) and supplement equation 2; sign by generalised winding numbers
 (Jacobson et al. 2013, Barill et al. 2018), since limbs of posed bodies overlap and normals or ray parity are wrong in
 there.
 

@@ -1,4 +1,5 @@
-"""Tiny sequences in the format on disk: a tube of cloth that sways behind a swaying capsule. No physics, no downloads."""
+"""Tiny sequences in the format on disk: a tube of cloth that sways behind a swaying capsule. No physics, no
+downloads."""
 
 from __future__ import annotations
 
@@ -6,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-
 from warpgarment.training.dataset import write_sequence
 
 

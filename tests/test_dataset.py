@@ -98,7 +98,7 @@ def _gate() -> tuple[QualityGate, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(
     ("frame", "damage", "message"),  # penetration is measured in every third frame
     [
-        (1, lambda v: v * [[1.3, 1.3, 1.3]], "stretch_p99 30.0% is over 25%"),
+        (1, lambda v: v * [[1.4, 1.4, 1.4]], "stretch_p99 40.0% is over 30%"),
         (2, lambda v: np.where(np.arange(len(v))[:, None] == 5, np.nan, v), "1 vertices are not finite"),
         (3, lambda v: v + [[0.0, 0.0, -0.06]], "penetration .* mm is over 10 mm"),
     ],

@@ -1,4 +1,4 @@
-"""The collision refinement against a float64 direct solve of all unknowns; its gradients against a dense torch solve."""
+"""The collision refinement against a float64 direct solve of all unknowns; its gradients against a dense solve."""
 
 import warnings
 
@@ -26,9 +26,12 @@ def poisoned(monkeypatch):
 
 
 def ellipsoid(x: float = 0.05) -> meshes.Mesh:
-    """A torso that the skirts stick in by up to some 30 mm on one side."""
+    """A torso that the skirts stick in by up to some 30 mm on one side.
+
+    It shares no plane of symmetry with them: where two faces are equally close, either is right, and results differ.
+    """
     ball = meshes.icosphere(3, 1.0)
-    return meshes.Mesh((ball.vertices * [0.19, 0.5, 0.2] + [x, 0.75, 0.0]).astype(np.float32), ball.faces)
+    return meshes.Mesh((ball.vertices * [0.19, 0.5, 0.2] + [x, 0.757, 0.013]).astype(np.float32), ball.faces)
 
 
 def body_of(mesh: meshes.Mesh) -> BodyMeshes:
@@ -60,7 +63,9 @@ def test_result_is_the_minimiser(rest, solver):
     """A wrong system, contact or stop. 0.02 mm is promised; detection in float32 accounts for 0.001 mm."""
     vertices, body = moved(rest), ellipsoid()
     if np.ptp(rest.vertices[:, 2]) == 0:
-        vertices = (vertices + [-0.25, 0.55, 0.18]).astype(np.float32)  # the sheet, hung in front of the belly
+        vertices = (vertices + np.array([-0.243, 0.55, 0.18])).astype(
+            np.float32
+        )  # the sheet, hung in front of the belly
     contacts = reference.contacts(vertices, body.vertices, body.faces, EPSILON)
     exact = reference.refine(vertices, rest.vertices, rest.faces, *contacts, EPSILON)
     solver = solver_for(rest, **SOLVERS[solver])
@@ -99,7 +104,7 @@ def test_nothing_moves_without_contact(solver):
 
 
 def test_packed_batch_is_the_garments_one_by_one():
-    """Garments of a batch that reach into each other, equal ones that share an inverse, or one that goes to the wrong body.
+    """Garments of a batch that reach into each other, equal ones that share an inverse, or the wrong body.
 
     The middle one is solved for displacements, the others for forces. The same to 1e-6 m: sums run in another order.
     """
@@ -127,11 +132,13 @@ def test_budget_of_the_inverses_is_kept():
     solver = solver_for(both, compliance_budget=count**2)
     assert len(solver._model[10]) == count**2
     result = solver.refine(torch.tensor(both.vertices), body_of(ellipsoid()))
-    np.testing.assert_allclose(result, solver_for(both).refine(torch.tensor(both.vertices), body_of(ellipsoid())), atol=TOLERANCE)
+    np.testing.assert_allclose(
+        result, solver_for(both).refine(torch.tensor(both.vertices), body_of(ellipsoid())), atol=TOLERANCE
+    )
 
 
 def test_passes_repeat_detection_and_solve():
-    """`passes` that solve the same contacts again, or start from the first input. Two calls are the same, bit for bit."""
+    """`passes` that solve the same contacts again, or start from the first input. Two calls are the same."""
     rest, bodies = meshes.skirt(24, 8, waist=0.17), body_of(ellipsoid())
     solver = solver_for(rest)
     first = solver.refine(torch.tensor(rest.vertices), bodies)
@@ -188,7 +195,8 @@ def test_gradient_is_that_of_a_dense_solve(solver):
     constraint = np.zeros((len(index), count, 3))
     constraint[np.arange(len(index)), index] = normals
     constraint = constraint.reshape(len(index), -1)
-    matrix = np.kron(reference.base(rest.vertices, rest.faces, 0.5, 1e-3).toarray(), np.eye(3)) + constraint.T @ constraint
+    base = reference.base(rest.vertices, rest.faces, 0.5, 1e-3).toarray()
+    matrix = np.kron(base, np.eye(3)) + constraint.T @ constraint
     jacobian = np.eye(3 * count) - np.linalg.solve(matrix, constraint.T @ constraint)
     weights = np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32)
     expected = (jacobian.T @ weights.ravel().astype(np.float64)).reshape(-1, 3)
@@ -213,11 +221,20 @@ def test_operator_passes_opcheck():
 def test_many_lanes_give_the_same_result(monkeypatch, solver):
     """A missing barrier or a wrong stride, which one lane can't show. 256 lanes a block, as on a GPU."""
     rest, bodies = meshes.skirt(12, 4, waist=0.17), body_of(ellipsoid())
-    solver = solver_for(rest, **SOLVERS[solver])
-    vertices = torch.tensor(rest.vertices)
-    one = solver.refine(vertices, bodies)
+    solver, vertices = solver_for(rest, **SOLVERS[solver]), torch.tensor(rest.vertices, requires_grad=True)
+    query = bodies.query(vertices)
+    closest, normals = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
+    limit = torch.full((1,), 1e-6, dtype=torch.float64)
+
+    def solve():
+        model = solver._model
+        result, _, _ = torch.ops.warpgarment.collision_solve(vertices, normals, closest, EPSILON, limit, model, 500)
+        return result, *torch.autograd.grad((result**3).sum(), vertices)
+
+    one = solve()
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    np.testing.assert_allclose(solver.refine(vertices, bodies), one, atol=2e-6)
+    for many, single in zip(solve(), one, strict=True):
+        np.testing.assert_allclose(many.detach(), single.detach(), atol=2e-6)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -245,7 +262,9 @@ def test_not_a_number_stays_visible():
     normals[7, 0] = 1.0
     for options in SOLVERS.values():
         model = solver_for(rest, **options)._model
-        broken = torch.ops.warpgarment.collision_solve(vertices + torch.nan, normals, 0.0 * normals, EPSILON, limit, model, 50)
+        broken = torch.ops.warpgarment.collision_solve(
+            vertices + torch.nan, normals, 0.0 * normals, EPSILON, limit, model, 50
+        )
         assert broken[0].isnan().all()
 
 
@@ -272,7 +291,11 @@ def test_bad_arguments_are_refused(change, error, message):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"lambda_reg": 0.0}, "lambda_reg"), ({"lambda_lap": -1.0}, "lambda_lap"), ({"max_iterations": 0}, "max_iterations")],
+    [
+        ({"lambda_reg": 0.0}, "lambda_reg"),
+        ({"lambda_lap": -1.0}, "lambda_lap"),
+        ({"max_iterations": 0}, "max_iterations"),
+    ],
 )
 def test_bad_options_are_refused(options, message):
     """A singular or indefinite system that the iteration would wander in."""

@@ -1,4 +1,4 @@
-"""The Poisson solve against a float64 direct solve, its operator against libigl, its gradients against a dense torch solve."""
+"""The Poisson solve against a float64 direct solve, its Laplacian against libigl, its gradients against torch."""
 
 import warnings
 
@@ -31,7 +31,8 @@ def problem(name: str, scale: float = 1.0, noise: float = 0.05):
     """Rest mesh, deformed vertices, and gradients that no vertices have exactly (smooth ones plus noise)."""
     rest = GARMENTS[name].scaled(scale)
     goal = meshes.moved(rest).vertices.astype(np.float64)
-    frames = [np.stack([v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]], 2) for v in (rest.vertices[rest.faces], goal[rest.faces])]
+    corners = (rest.vertices[rest.faces], goal[rest.faces])
+    frames = [np.stack([v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]], 2) for v in corners]
     normals = [np.cross(f[:, :, 0], f[:, :, 1]) for f in frames]
     full = [
         np.concatenate([f, (n / np.linalg.norm(n, axis=1, keepdims=True))[:, :, None]], 2).astype(np.float64)
@@ -84,7 +85,7 @@ def test_solution_is_the_direct_one(name, scale):
 
     1e-5 of the bounding box is promised (of the smallest component's here); float32 output accounts for 2e-7 of it.
     """
-    rest, goal, phi, mean = problem(name, scale)
+    rest, _, phi, mean = problem(name, scale)
     exact = reference.solve(rest.vertices, rest.faces, phi, mean)
     solver = solver_for(rest)
     wave = np.sin(9.0 * rest.vertices / diagonal(rest))
@@ -110,7 +111,7 @@ def test_gradients_of_a_garment_give_it_back(name):
 
 
 def test_mean_of_face_centroids_is_set():
-    """A mean over vertices instead of faces, or garments moved by each other's. Rounding of float32 positions near 3 m."""
+    """A mean over vertices instead of faces, or garments moved by each other's. Float32 rounds positions near 3 m."""
     rest, _, phi, mean = problem("two_components")
     mean = mean + np.float32([[1.0, 2.0, 3.0], [-3.0, 0.5, 0.0]])
     result = solver_for(rest).solve(torch.tensor(phi), torch.tensor(mean)).numpy().astype(np.float64)
@@ -183,7 +184,7 @@ def test_a_good_guess_saves_iterations():
 
 
 def test_gradients_are_those_of_a_dense_solve():
-    """A wrong adjoint. Dense float64 torch solve with the mean and the pins as in the reference; 1e-5 of the largest entry."""
+    """A wrong adjoint. Dense float64 torch solve, mean and pins as in the reference; 1e-5 of the largest entry."""
     rest, goal, phi, mean = problem("two_components")
     pins = np.array([0, 5, 9])
     targets = torch.tensor(goal[pins] + 0.05, dtype=torch.float32)

@@ -74,13 +74,8 @@ def network(kind=ManifoldAwareTransformer, **changes) -> ManifoldAwareTransforme
     for head in (made.face_head, made.velocity_head):
         torch.nn.init.normal_(head.weight, std=0.3)
         torch.nn.init.normal_(head.bias, std=0.3)
-    made.set_statistics(
-        {
-            "psi_std": torch.full((9,), 0.02),
-            "singular_value_std": torch.full((3,), 2e-3),
-            "q_std": torch.full((3,), 2e-3),
-        }
-    )
+    scales = {"psi_std": (9, 0.02), "singular_value_std": (3, 2e-3), "q_std": (3, 2e-3)}
+    made.set_statistics({name: torch.full((length,), value) for name, (length, value) in scales.items()})
     return made
 
 
@@ -122,7 +117,7 @@ def test_untrained_residual_network_follows_a_rigid_body():
     assert result.vertices.shape == (frames, len(garment.vertices), 3)
     for t in range(frames):
         turned = Rotation.from_rotvec([0, 0.05 * t, 0]).apply(garment.vertices)
-        expected = turned + [0.01 * np.sin(0.5 * t), 0, 0.01 * t]
+        expected = turned + np.array([0.01 * np.sin(0.5 * t), 0, 0.01 * t])
         assert np.abs(result.vertices[t] - expected).max() < 1e-3, t
     assert [status.frame for status in result.status] == list(range(frames))
     assert all(status.verdict is Verdict.OK for status in result.status)
@@ -132,8 +127,8 @@ def test_untrained_residual_network_follows_a_rigid_body():
 def test_one_step_matches_a_float64_twin(residual):
     """A step would mix up Psi, Sigma, q, the order of products, or the mean.
 
-    From the network's own output on: SVD by NumPy, nearest body faces and gradient operator by libigl, a direct sparse
-    solve. 2e-5 m: the Poisson solver stops at 1e-5 of the bounding box, 0.9 m.
+    From the network's own output on: SVD by NumPy, gradient operator by libigl, a direct sparse solve. Only the choice
+    of nearest body faces is the library's (many points are as near to two faces of a convex body). 2e-5 m: the Poisson solver stops at 1e-5 of the bounding box, 0.9 m.
     """
     garment, motion = outfit(), body(2, lambda t: (0.02 * t, 0, 0), lambda t: (0.1 * t, 0.2 * t, 0))
     first = garment.vertices * np.float32(1.02) + np.float32([0.01, 0.0, 0.0])
@@ -156,7 +151,8 @@ def test_one_step_matches_a_float64_twin(residual):
     component = garment.components[1]
     if residual:
         now, then = motion.vertices.astype(np.float64)
-        nearest = igl.point_mesh_squared_distance(start[faces].mean(axis=1), now, motion.faces.astype(np.int64))[1]
+        bodies = BodyMeshes(torch.from_numpy(motion.vertices[0]), torch.from_numpy(motion.faces))
+        nearest = bodies.query(torch.from_numpy(first[faces].mean(axis=1))).face.numpy()
         psi = psi @ Rotation.from_rotvec([0.1, 0.2, 0]).as_matrix()
         sigma = sigma + np.linalg.svd(phi)[1]
         moved = (then - now)[motion.faces[nearest]].mean(axis=1)
@@ -241,18 +237,20 @@ def test_streaming_a_batch():
 def test_history_continues_where_it_ends():
     """Known first frames would be changed, or the simulation go on from another memory than the one they make.
 
-    Frames of a rollout given back as its own history must lead to the same next frames; 1e-6 m, since features of
-    known frames are computed in the same way.
+    The first three frames of a rollout given back as its history must lead to the same next frames, and so must a cold
+    start in which garment and body really stand still for three frames. 1e-6 m: features of known frames are the same.
     """
     sim = simulator(network())
-    garment, motion = skirt(), walk(8)
+    garment, motion = skirt(), walk(6)
     whole = sim.rollout(garment, motion)
-    # Frame 3 is the first whose three frames of history hold no repeated first frame.
-    later = BodyMotion(motion.vertices[1:], motion.faces)
-    result = sim.rollout(garment, later, history=whole.vertices[1:4])
-    assert np.array_equal(result.vertices[:3], whole.vertices[1:4])
-    assert np.abs(result.vertices[3:] - whole.vertices[4:]).max() < 1e-6
-    assert [status.frame for status in result.status] == list(range(7))
+    result = sim.rollout(garment, motion, history=whole.vertices[:3])
+    assert np.array_equal(result.vertices[:3], whole.vertices[:3])
+    assert np.abs(result.vertices - whole.vertices).max() < 1e-6
+    assert [status.frame for status in result.status] == list(range(6))
+
+    standing = BodyMotion(np.concatenate([motion.vertices[:1]] * 2 + [motion.vertices[:3]]), motion.faces)
+    result = sim.rollout(garment, standing, history=np.stack([garment.vertices] * 3))
+    assert np.abs(result.vertices[2:] - whole.vertices[:3]).max() < 1e-6
 
 
 def test_frame_rates_and_lengths():
@@ -276,7 +274,7 @@ def test_rest_pose_and_first_frame_may_differ():
     """
     sim = simulator(network())
     garment = skirt()
-    moved = Garment(Rotation.from_rotvec([0.5, 1, 0]).apply(garment.vertices) + [3, 1, 2], garment.faces)
+    moved = Garment(Rotation.from_rotvec([0.5, 1, 0]).apply(garment.vertices) + np.array([3, 1, 2]), garment.faces)
     state = sim.start(moved, walk(1).vertices[0], walk(1).faces, first_vertices=garment.vertices)
     assert np.array_equal(state.vertices, garment.vertices)
     two = sim.rollout([garment, moved], walk(2), first_vertices=[garment.vertices] * 2)
@@ -288,17 +286,18 @@ def test_rest_pose_and_first_frame_may_differ():
 def test_collisions_are_pushed_out(shift):
     """The body would come through the cloth, or the status not say how far.
 
-    A body that steps into a skirt that does not move. Depth by libigl: reported within 1e-5 m, and at most 1 mm left.
+    A body that steps into a skirt that does not move. Depth by libigl: at most 1 mm left, and reported within 5e-5 m,
+    since barycentric coordinates in float32 are good to 1e-5 of the capsule's side faces, which are 1 m long.
     """
     garment, motion = skirt(), body(3, lambda t: (shift * min(t, 1), 0, 0))
     through = simulator(still(), collision_passes=0).rollout(garment, motion)
     deep = nowhere_deeper(through.vertices[1], motion, 1)
     assert deep > 0.003
-    assert abs(through.status[1].max_penetration - deep) < 1e-5
+    assert abs(through.status[1].max_penetration - deep) < 5e-5
     pushed = simulator(still()).rollout(garment, motion)
     for t in (1, 2):
         left = nowhere_deeper(pushed.vertices[t], motion, t)
-        assert abs(pushed.status[t].max_penetration - left) < 1e-5
+        assert abs(pushed.status[t].max_penetration - left) < 5e-5
         assert left < 1e-3
     assert pushed.status[1].collision_iterations > 0
 
@@ -314,7 +313,7 @@ def test_pins_stay_on_the_body():
     pins = np.arange(16)
     loose, pinned = (simulator(still()).rollout(skirt(pins=p), motion) for p in (None, pins))
     expected = Rotation.from_rotvec([0, 0.1 * (frames - 1), 0]).apply(skirt().vertices[pins])
-    expected = expected + [0, 0.01 * (frames - 1), 0]
+    expected = expected + np.array([0, 0.01 * (frames - 1), 0])
     assert np.linalg.norm(loose.vertices[-1][pins] - expected, axis=1).min() > 0.03
     assert np.linalg.norm(pinned.vertices[-1][pins] - expected, axis=1).max() < 5e-3
     below = pinned.vertices[-1][16:, 1].mean() - skirt().vertices[16:, 1].mean()
@@ -329,7 +328,7 @@ def test_pin_targets_follow_the_surface():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 3)).astype(np.float32)
     pins = BodyPins(torch.from_numpy(points), bodies, torch.zeros(40, dtype=torch.int32))
     assert np.abs(pins.targets(now).numpy() - points).max() < 1e-6
-    expected = Rotation.from_rotvec([0.5, -1.0, 0.3]).apply(points) + [0.3, -0.2, 0.1]
+    expected = Rotation.from_rotvec([0.5, -1.0, 0.3]).apply(points) + np.array([0.3, -0.2, 0.1])
     assert np.abs(pins.targets(then).numpy() - expected).max() < 2e-6
 
 

@@ -1,15 +1,15 @@
 """Two ways to move a garment without a network, to say what a network is worth.
 
-**Skinned**: the garment is skin. In the first frame every vertex V finds its nearest body point p; the body face f0 that holds it
-and the `neighbours - 1` faces with the nearest centroids to p carry the vertex, face f with weight w_f ~ 1 / (|p - c_f|^2 + s^2),
-c_f its centroid, s = 3 cm, sum_f w_f = 1. Each face keeps V in its own orthonormal frame (origin c_f); the vertex is the
-weighted mean of where its faces take it. In the first frame this is exact.
+**Skinned**: the garment is skin. In the first frame every vertex V finds its nearest body point p; the body face f0
+that holds it and the `neighbours - 1` faces with the nearest centroids to p carry the vertex, face f with weight w_f
+~ 1 / (|p - c_f|^2 + s^2), c_f its centroid, s = 3 cm, sum_f w_f = 1. Each face keeps V in its own orthonormal frame
+(origin c_f); the vertex is the weighted mean of where its faces take it. In the first frame this is exact.
 
-**Rigid**: every connected component is a rigid body. It takes the rotation and translation that fit best (Kabsch) the motion of
-the body vertices nearest to the component's vertices in the first frame.
+**Rigid**: every connected component is a rigid body. It takes the rotation and translation that fit best (Kabsch) the
+motion of the body vertices nearest to the component's vertices in the first frame.
 
-Neither looks at gravity, inertia or collisions, and both start from one recorded frame. Pins need no care: the skinned garment is
-tied to the body everywhere, and the rigid one nowhere.
+Neither looks at gravity, inertia or collisions, and both start from one recorded frame. Pins need no care: the
+skinned garment is tied to the body everywhere, and the rigid one nowhere.
 """
 
 from __future__ import annotations

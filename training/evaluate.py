@@ -2,9 +2,10 @@
 
     warpgarment evaluate --data sequences --network out/run/best.safetensors --out out/evaluation
 
-Every sequence is rolled out autoregressively twice: **warm**, from its first ten recorded frames, and **cold**, from the first
-alone. Only predicted frames count. Baselines start from the newest frame that the network saw. Pins are tied to the body's
-surface where they were in the first frame the method saw, as in any simulation; nothing recorded is used after the start.
+Every sequence is rolled out autoregressively twice: **warm**, from its first ten recorded frames, and **cold**, from
+the first alone. Only predicted frames count. Baselines start from the newest frame that the network saw. Pins are
+tied to the body's surface where they were in the first frame the method saw, as in any simulation; nothing recorded
+is used after the start.
 
 Writes `evaluation.json`, `evaluation.md` and `error_over_time.png`, each complete or not at all.
 """
@@ -22,14 +23,14 @@ from typing import Any
 
 import numpy as np
 from tqdm import tqdm
+from warpgarment.training.baselines import rigid, skinned
+from warpgarment.training.dataset import Sequence, list_sequences
+from warpgarment.training.rollouts import predict
 
 from warpgarment import checkpoint, metrics
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
 from warpgarment.simulator import Simulator
-from warpgarment.training.baselines import rigid, skinned
-from warpgarment.training.dataset import Sequence, list_sequences
-from warpgarment.training.rollouts import predict
 
 METHODS = ("network", "skinned", "rigid")
 STARTS = ("warm", "cold")
@@ -127,7 +128,8 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
                 vertices = run()
                 if method == "network":
                     spent, predicted_frames = spent + time.perf_counter() - began, predicted_frames + steps
-                row[method] = figures(vertices, truth, sequence.garment.faces, after, body.faces, config.geodesic_frames)
+                faces = sequence.garment.faces
+                row[method] = figures(vertices, truth, faces, after, body.faces, config.geodesic_frames)
                 error = 100.0 * np.linalg.norm(vertices.astype(np.float64) - truth, axis=-1).mean(axis=1)
                 curves.setdefault((method, start), []).append(error)
             rows.append(row)
@@ -194,10 +196,16 @@ def write(out: Path, result: dict[str, Any], curves: dict[tuple[str, str], list[
 
 def table(result: dict[str, Any]) -> str:
     """The result as Markdown: means first, then every sequence."""
-    lines = ["# Evaluation", "", f"Network `{result['network']['file']}`, data `{result['settings']['data']}`, "
-             f"{result['frames_predicted']:,} predicted frames, {1000 * result['seconds_per_frame']:.0f} ms a frame.", "",
-             "Warm: from ten recorded frames; cold: from the first alone. Only predicted frames count. Chamfer and geodesic "
-             "distortion at sampled frames; deepest: of all sequences.", ""]  # fmt: skip
+    lines = [
+        "# Evaluation",
+        "",
+        f"Network `{result['network']['file']}`, data `{result['settings']['data']}`: "
+        f"{result['frames_predicted']:,} predicted frames, {1000 * result['seconds_per_frame']:.0f} ms each.",
+        "",
+        "Warm: from ten recorded frames; cold: from the first alone. Only predicted frames count. Chamfer and "
+        "geodesic distortion at sampled frames; deepest: of all sequences.",
+        "",
+    ]
     headings = [heading for heading, _ in FIGURES.values()]
     lines += _row(["start", "method", *headings, "failed"]), _row(["---"] * (len(headings) + 3))
     for start, methods in result["mean"].items():

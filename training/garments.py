@@ -65,7 +65,7 @@ def sampled_pattern(category: str, rng: np.random.Generator, faces: int) -> Patt
         leg=float(rng.uniform(0.45, 0.92)),
         skirt_length=float(rng.uniform(0.35, 0.65)),
         flare=float(rng.uniform(0.08, 0.22)),
-        ease=float(rng.uniform(0.016, 0.024) if loose else rng.uniform(0.012, 0.020)),
+        ease=float(rng.uniform(0.028, 0.040) if loose else rng.uniform(0.012, 0.020)),
         neck=float(rng.uniform(0.0, 0.02)),
         faces=int(round(faces * _SIZE[category] * rng.uniform(0.85, 1.15))),
     )

@@ -1,14 +1,15 @@
 """What a garment sees of its body, computed once per sequence and kept beside the data.
 
 Closest points and signs depend on the recorded garment, not on the network, and slightly moved garments may reuse them
-(`kernels.features.face_features` recomputes the distance from the closest point). So the signed-distance queries, by far the
-dearest part of a training sample, are done once for every frame t in 0..T-2 and stored as one memory-mapped array
+(`kernels.features.face_features` recomputes the distance from the closest point). So the signed-distance queries, by
+far the dearest part of a training sample, are done once for every frame t in 0..T-2 and stored as one memory-mapped
+array
 
     interaction.npy   float32 [T-1, F, 16]   columns: see COLUMNS; row t holds the body's motion from frame t to t + 1
     geodesics.npy     float32 [F, F]         metres, inf across components
 
-in a folder named after the sequence and the checksum of everything that went in (array files, versions). A folder is written
-under another name and renamed when complete, so that what exists is whole.
+in a folder named after the sequence and the checksum of everything that went in (array files, versions). A folder is
+written under another name and renamed when complete, so that what exists is whole.
 
     python -m warpgarment.training.interactions DATA [CACHE]        # fills the cache before a training run
 """
@@ -25,11 +26,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-
-import warpgarment
 from warpgarment.kernels.deformation import face_centroids
 from warpgarment.kernels.features import BodyInteraction, body_interaction
 from warpgarment.kernels.sdf import BodyMeshes
+
+import warpgarment
 
 CACHE_VERSION = 1
 WIDTH = 16
@@ -132,7 +133,8 @@ def cached(sequence, folder: Path, cache: Path, device: torch.device | str = "cp
         try:
             np.save(temporary / "interaction.npy", interaction)
             np.save(temporary / "geodesics.npy", np.asarray(sequence.garment.geodesics, np.float32))
-            (temporary / "manifest.json").write_text(json.dumps({"cache_version": CACHE_VERSION, "device": str(device)}))
+            manifest = {"cache_version": CACHE_VERSION, "device": str(device)}
+            (temporary / "manifest.json").write_text(json.dumps(manifest))
             try:
                 os.replace(temporary, place)
             except OSError:  # another process was first, or what lies there is incomplete

@@ -1,7 +1,7 @@
 """Which samples make up which step, and the thread that builds them ahead of the training loop.
 
-Everything about step n follows from (seed, n): the epoch's order, the subsets of faces, the noise. So a resumed run sees
-the same batches as one that never stopped, and how far ahead the thread runs does not matter.
+Everything about step n follows from (seed, n): the epoch's order, the subsets of faces, the noise. So a resumed run
+sees the same batches as one that never stopped, and how far ahead the thread runs does not matter.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable, Iterator
 
 import numpy as np
-
 from warpgarment.training.pushforward import Pool
 from warpgarment.training.samples import Batch, SampleBuilder
 

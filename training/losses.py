@@ -2,9 +2,10 @@
 
     L = L_def + lambda_sv L_sv + lambda_vel L_vel        lambda_sv = 1, lambda_vel = 3
 
-Each term sums the absolute differences of a face's (or component's) numbers and averages over faces (components). `units` says
-in which units: "normalised" divides every number by its standard deviation over the training set, so that nine small numbers
-and three smaller ones count alike; "physical" is the paper as printed (dimensionless Psi and Sigma, metres per frame).
+Each term sums the absolute differences of a face's (or component's) numbers and averages over faces (components).
+`units` says in which units: "normalised" divides every number by its standard deviation over the training set, so
+that nine small numbers and three smaller ones count alike; "physical" is the paper as printed (dimensionless Psi and
+Sigma, metres per frame).
 """
 
 from __future__ import annotations

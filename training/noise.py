@@ -1,10 +1,11 @@
 """Perturbed histories: what a rollout's own errors look like, so that the network learns to undo them.
 
-A garment of V vertices carries a basis of smooth random displacement fields at several scales: white noise on the vertices,
-smoothed by k applications of the averaging operator (A V)_i = (V_i + mean of the neighbours of i) / 2 and scaled to unit RMS.
-A displacement of the history is
+A garment of V vertices carries a basis of smooth random displacement fields at several scales: white noise on the
+vertices, smoothed by k applications of the averaging operator (A V)_i = (V_i + mean of the neighbours of i) / 2 and
+scaled to unit RMS. A displacement of the history is
 
-    delta_h = amplitude * (sum_j b_j c_hj + white noise + one offset per component),      c_h = c_H + random walk backwards in time,
+    delta_h = amplitude * (sum_j b_j c_hj + white noise + one offset per component),      c_h = c_H + random walk
+    backwards in time,
 
 mostly the same in all frames, as a drift is. The amplitude halves from each scale to the next finer one, so every scale
 stretches the cloth about equally. Near pins the displacement fades out: a rollout does not drift there.
@@ -98,7 +99,7 @@ class NoiseBasis:
         if clean < config.clean or (config.position == 0.0 and config.offset == 0.0):
             return None
         fields, count = self.fields.shape[1], len(self.fade)
-        # Newest frame first while the walk is summed: the error was smaller in some direction before, larger in another.
+        # Newest frame first while the walk is summed, so that the newest frame has the stated amplitude.
         steps = rng.standard_normal((frames, fields + self.components, 3)).astype(np.float32)
         steps[1:] *= config.walk
         steps = np.cumsum(steps, axis=0)[::-1]

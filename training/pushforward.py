@@ -1,9 +1,10 @@
 """What the network's own rollouts do wrong, as displacements of recorded frames that training samples can start from.
 
-A few short rollouts start from recorded history (or cold, from frame 0) at random places of the training set. After k steps the
-newest k frames differ from the recorded ones by what the network did wrong; these differences override the newest frames
-of a sample's history, whose answer then leads back to the recorded motion. The pool is refreshed every so many steps; between
-refreshes it does not change, and it is part of the saved training state, so that resumed runs see the same samples.
+A few short rollouts start from recorded history (or cold, from frame 0) at random places of the training set. After k
+steps the newest k frames differ from the recorded ones by what the network did wrong; these differences override the
+newest frames of a sample's history, whose answer then leads back to the recorded motion. The pool is refreshed every
+so many steps; between refreshes it does not change, and it is part of the saved training state, so that resumed runs
+see the same samples.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-
 from warpgarment.training.rollouts import predict
 
 
@@ -93,11 +93,11 @@ class Pool:
             data = sequences[s]
             cold = rng.random() < config.cold or data.count <= history
             newest = 0 if cold else int(rng.integers(history - 1, data.count))
-            steps = min(config.steps, data.count - 1 - newest)  # the frame after the last one is a target, and must exist
+            steps = min(config.steps, data.count - 1 - newest)  # the frame after the last one is a target
             if steps < 1:
                 continue
             recorded = data.vertices[newest + 1 : newest + 1 + steps].cpu().numpy()
-            predicted = predict(simulator, data.source, newest, steps, cold=cold)
+            predicted = predict(simulator, data.source, newest, steps, cold=cold, body=data.body)
             displacement = (predicted - recorded).astype(np.float32)
             error = np.linalg.norm(displacement, axis=-1).mean(axis=1)
             good = np.isfinite(error) & (error < config.limit)

@@ -21,7 +21,7 @@ class Limits:
     """
 
     penetration: float = 0.010
-    stretch: float = 0.25
+    stretch: float = 0.30
     largest_stretch: float = 1.0
     slip: float = 0.15
 

@@ -1,4 +1,5 @@
-"""Rollouts that start from recorded frames of a sequence: warm, from as many as the network remembers, or cold, from one.
+"""Rollouts that start from recorded frames of a sequence: warm, from as many as the network remembers, or cold, from
+one.
 
 A cold start is the recorded frame repeated on a body that stands still, which is what the network was trained on.
 """

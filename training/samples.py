@@ -1,25 +1,27 @@
-"""Training samples: histories of perturbed garments, as the network will meet them in a rollout, and what it should answer.
+"""Training samples: histories of perturbed garments, as the network will meet them in a rollout, and what it should
+answer.
 
-A sample is a sequence and its newest history frame t; the target is frame t + 1. Frames before the first repeat it, with
-a body at rest, exactly as a cold start does. Garment positions of the history are displaced (by `noise`, or by what a rollout
-of the network itself did wrong), and everything is recomputed from the displaced positions, the answer too:
+A sample is a sequence and its newest history frame t; the target is frame t + 1. Frames before the first repeat it,
+with a body at rest, exactly as a cold start does. Garment positions of the history are displaced (by `noise`, or by
+what a rollout of the network itself did wrong), and everything is recomputed from the displaced positions, the answer
+too:
 
     Psi = Phi_{t+1} (Phi~_t)^-1      Sigma = Sigma_{t+1}      q = z_{t+1} - z~_t            (~ displaced)
 
-so the answer leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces and
-frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but components.
+so the answer leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces
+and frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but
+components.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-
-from warpgarment.heading import rotation_about_up, yaw
 from warpgarment.kernels.deformation import (
     deformation_gradient_from_inverse,
     inverse_rest_frames,
@@ -27,16 +29,20 @@ from warpgarment.kernels.deformation import (
     singular_values,
 )
 from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
-from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached, unpack
 from warpgarment.training.noise import NoiseBasis, NoiseConfig
+
+from warpgarment.body import BodyMotion
+from warpgarment.heading import rotation_about_up, yaw
+from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 
 MIRROR = torch.tensor([-1.0, 1.0, 1.0])
 MIRROR_MATRIX = torch.outer(MIRROR, MIRROR).flatten()
 
 
 class Batch(NamedTuple):
-    """Training samples; lengths in metres, in the network's frame (turned to its heading, mirrored, as the settings say)."""
+    """Training samples; lengths in metres, in the network's frame (turned to its heading, mirrored, as the settings
+    say)."""
 
     features: torch.Tensor  # [B,N,H*34] oldest first
     velocities: torch.Tensor  # [B,C,(H-1)*3]
@@ -48,8 +54,9 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Symmetries of the problem. `mirror`: share of samples mirrored in x; `yaw`: standard deviation [degrees] of a joint
-    turn of world and rest pose; `world_yaw`: turn the world by any angle (for networks with heading "world")."""
+    """Symmetries of the problem. `mirror`: share of samples mirrored in x; `yaw`: standard deviation [degrees] of a
+    joint turn of world and rest pose; `world_yaw`: turn the world by any angle (for networks with heading
+    "world")."""
 
     mirror: float = 0.5
     yaw: float = 5.0
@@ -98,6 +105,11 @@ class SequenceData:
         hot = hot / hot.sum(dim=0).clamp(min=1.0)
         self.body_velocity = torch.einsum("fc,tfk->tck", hot, velocity)  # [T-1,C,3], over all faces
         self.yaw = self._yaw()  # [T-1]
+
+    @cached_property
+    def body(self) -> BodyMotion:
+        """The collider, for rollouts."""
+        return self.source.body()
 
     @property
     def count(self) -> int:

@@ -74,7 +74,7 @@ def load(
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             progress = json.loads(file.metadata()["progress"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
 
         def part(prefix: str) -> dict[str, torch.Tensor]:
             return {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
@@ -87,6 +87,6 @@ def load(
             state.setdefault(int(index), {})[key] = value
         optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     except Exception as error:
-        raise CheckpointError(f"{path}: cannot resume from this file ({error}); start anew with resume=False") from error
+        raise CheckpointError(f"{path}: cannot resume from it ({error}); start anew with resume=False") from error
     average.updates = progress["average_updates"]
     return {k: v for k, v in tensors.items() if k.split(".")[0] not in ("network", "average", "optimizer")}, progress

@@ -1,13 +1,13 @@
 """The training loop.
 
-    warpgarment train --data sequences --out out/run --time-limit 60                 # one CPU core, an hour
-    warpgarment train --data sequences --out out/run --steps 20000 --device cuda      # one GPU, a stated number of steps
-    warpgarment train --data sequences --out out/run --time-limit 60 --resume         # goes on where it stopped
+    warpgarment train --data sequences --out out/run --time-limit 60              # one CPU core, an hour
+    warpgarment train --data sequences --out out/run --steps 20000 --device cuda  # one GPU, so many steps
+    warpgarment train --data sequences --out out/run --time-limit 60 --resume     # goes on where it stopped
 
-Writes into the out folder: `network.safetensors` (averaged weights, ships), `best.safetensors` (the same at the best validation
-rollout), `state.safetensors` (everything needed to resume), `log.jsonl`, `config.json`, and TensorBoard events where installed.
-The schedule is a function of the step where `steps` is given, and of the time where only `time_limit` is. With `steps`, a
-resumed run on one CPU gives the losses of an uninterrupted one, bit for bit.
+Writes into the out folder: `network.safetensors` (averaged weights, ships), `best.safetensors` (the same at the best
+validation rollout), `state.safetensors` (everything needed to resume), `log.jsonl`, `config.json`, and TensorBoard
+events where installed. The schedule is a function of the step where `steps` is given, and of the time where only
+`time_limit` is. With `steps`, a resumed run on one CPU gives the losses of an uninterrupted one, bit for bit.
 """
 
 from __future__ import annotations
@@ -23,11 +23,7 @@ from typing import Literal
 import numpy as np
 import torch
 from tqdm import tqdm
-
-from warpgarment import checkpoint
 from warpgarment.kernels.features import FEATURES
-from warpgarment.metrics import mean_vertex_error
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 from warpgarment.training import state as training_state
 from warpgarment.training.dataset import Sequence, list_sequences
 from warpgarment.training.interactions import default_cache
@@ -37,6 +33,10 @@ from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.pushforward import Pool, PushforwardConfig
 from warpgarment.training.rollouts import predict
 from warpgarment.training.samples import Augmentation, Batch, SampleBuilder, SequenceData
+
+from warpgarment import checkpoint
+from warpgarment.metrics import mean_vertex_error
+from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 
 
 class NoTrainingData(ValueError):
@@ -196,7 +196,8 @@ def load_sequences(config: TrainConfig, network: NetworkConfig, device, skipped:
             skipped[Path(folder).name] = f"{type(error).__name__}: {error}"
     if not sequences:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
-        raise NoTrainingData(f"{config.data}: {len(folders)} training sequences, none usable ({reasons or 'none found'})")
+        found = f"{len(folders)} training sequences, none usable ({reasons})" if folders else "no training sequences"
+        raise NoTrainingData(f"{config.data}: {found}")
     return sequences
 
 
@@ -222,7 +223,9 @@ def load_validation(config: TrainConfig, network: NetworkConfig, skipped: dict[s
 class Run:
     """One training run: what changes from step to step."""
 
-    def __init__(self, config: TrainConfig, network, plan: Plan, builder: SampleBuilder, validation: list, began: float):
+    def __init__(
+        self, config: TrainConfig, network, plan: Plan, builder: SampleBuilder, validation: list, began: float
+    ) -> None:
         self.config, self.network, self.validation, self.began = config, network, validation, began
         self.out = Path(config.out)
         self.device = next(network.parameters()).device
@@ -389,7 +392,8 @@ class Run:
         return Simulator(self.average.network, self.device)
 
     def _save_network(self, name: str) -> None:
-        notes = {"steps": self.step, "hours": round(self.elapsed() / 3600, 3), "rollout_error_cm": _json_number(self.best)}
+        hours = round(self.elapsed() / 3600, 3)
+        notes = {"steps": self.step, "hours": hours, "rollout_error_cm": _json_number(self.best)}
         notes["training"] = json.loads(json.dumps(dataclasses.asdict(self.config), default=str))
         for key in ("data", "out", "cache", "init"):
             notes["training"].pop(key)
@@ -422,16 +426,16 @@ class Run:
         frames = np.array([frame for _, frame in batch.ids])
         np.savez(path, sequence=names, frame=frames, **{k: v.cpu().numpy() for k, v in arrays.items()})
         raise NonFiniteLoss(
-            f"the loss of step {self.step} is not finite; its batch is in {path}. Look for features that are not finite "
-            "there; if there are none, lower lr and go on from the last saved state with resume."
+            f"the loss of step {self.step} is not finite; its batch is in {path}. Look for features that are not "
+            "finite there; if there are none, lower lr and go on from the last saved state with resume."
         )
 
 
 def statistics(batches, network: ManifoldAwareTransformer) -> dict[str, torch.Tensor]:
     """Means and standard deviations of inputs and targets over some batches.
 
-    Residual outputs keep the means that stand for skin; deviations have floors, so that numbers which hardly vary (a body
-    at rest, a singular value that is always one) are not blown up.
+    Residual outputs keep the means that stand for skin; deviations have floors, so that numbers which hardly vary (a
+    body at rest, a singular value that is always one) are not blown up.
     """
     samples: dict[str, list[torch.Tensor]] = {"feature": [], "velocity": [], "psi": [], "singular_value": [], "q": []}
     for batch in batches:

@@ -11,11 +11,31 @@ Tokens are N faces followed by C velocity tokens. In a manifold head faces liste
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import nn
 
 ACTIVATIONS = {"relu": F.relu, "gelu": F.gelu}
+
+
+def geodesic_weights(distances: torch.Tensor, radius: float, power: float) -> torch.Tensor:
+    """Attention weights of the manifold heads, softmax(-(D/r)^p) along rows (equation 1).
+
+    Args:
+        distances: Geodesic distances between face centroids [m], shape [...,N,N]; inf where there is no way.
+        radius: r [m]. A large power makes the weights a ball of this radius, a small one a smooth decay.
+        power: p.
+
+    Returns:
+        Shape [...,N,N], finite. Rows sum to one; a row whose distances are all inf (a padded one) is zero.
+    """
+    score = -((distances / radius) ** power)  # may overflow to -inf, which is weight 0 and right
+    score = torch.where(torch.isinf(distances), -math.inf, score)  # inf ** power is 1 for a power that rounds to 0
+    highest = score.amax(dim=-1, keepdim=True)
+    weight = torch.exp(score - torch.where(torch.isinf(highest), 0.0, highest))
+    return weight / weight.sum(dim=-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
 
 
 class ManifoldAwareAttention(nn.Module):

@@ -18,8 +18,6 @@ buffers and travel with the weights. What Psi, Sigma and q mean is in `parametri
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import os
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -28,9 +26,20 @@ import torch
 from torch import nn
 
 from warpgarment import heading as _heading
-from warpgarment.attention import ACTIVATIONS, EncoderLayer
+from warpgarment.attention import EncoderLayer, geodesic_weights
+from warpgarment.config import NetworkConfig
 from warpgarment.kernels.features import FEATURES
 from warpgarment.parametrisation import NetworkOutput
+
+__all__ = [
+    "STATISTICS",
+    "ManifoldAwareTransformer",
+    "NetworkConfig",
+    "NetworkOutput",
+    "NormalisedOutput",
+    "geodesic_weights",
+    "rotate_output",
+]
 
 STATISTICS = {  # buffers of the normalisation and their lengths
     "feature_mean": FEATURES,
@@ -46,91 +55,12 @@ STATISTICS = {  # buffers of the normalisation and their lengths
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class NetworkConfig:
-    """Everything that is not a weight. The defaults are the paper's."""
-
-    embedding: int = 512
-    layers: int = 8
-    feed_forward: int = 512
-    heads: int = 8
-    manifold_heads: int = 2
-    dropout: float = 0.1
-    history: int = 10  # frames
-    geodesic_power: float = 20.0
-    geodesic_radius: float = 1.0  # metres
-    residual: bool = False  # see parametrisation.py
-    heading: str = "world"  # or "canonical", see heading.py
-    norm_first: bool = False
-    activation: str = "relu"  # or "gelu"
-    fps: float = 30.0  # of the motions it was trained on
-
-    def __post_init__(self) -> None:
-        for name in ("embedding", "layers", "feed_forward", "heads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.embedding % self.heads:
-            raise ValueError(f"heads must divide embedding, got {self.heads} heads for embedding {self.embedding}")
-        if not 0 <= self.manifold_heads <= self.heads:
-            raise ValueError(f"manifold_heads must lie between 0 and heads={self.heads}, got {self.manifold_heads}")
-        if self.history < 2:
-            raise ValueError(f"history must be at least 2 frames, since velocities need two, got {self.history}")
-        if not 0.0 <= self.dropout < 1.0:
-            raise ValueError(f"dropout must lie in [0, 1), got {self.dropout}")
-        for name in ("geodesic_power", "geodesic_radius", "fps"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        if self.heading not in ("world", "canonical"):
-            raise ValueError(f'heading must be "world" or "canonical", got {self.heading!r}')
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
-
-    @classmethod
-    def base(cls, **changes: object) -> NetworkConfig:
-        """The paper's network, 12.8 million parameters."""
-        return cls(**changes)
-
-    @classmethod
-    def small(cls, **changes: object) -> NetworkConfig:
-        """A network for one CPU core, 0.5 million parameters."""
-        settings: dict[str, object] = {
-            "embedding": 128,
-            "layers": 4,
-            "feed_forward": 192,
-            "heads": 4,
-            "manifold_heads": 1,
-            "residual": True,
-            "heading": "canonical",
-            "norm_first": True,
-            "activation": "gelu",
-        }
-        return cls(**(settings | changes))
-
-
 class NormalisedOutput(NamedTuple):
     """Output of the network, or a target for it, in units of zero mean and unit variance."""
 
     psi: torch.Tensor  # [B,N,9]
     singular_values: torch.Tensor  # [B,N,3]
     velocity: torch.Tensor  # [B,C,3]
-
-
-def geodesic_weights(distances: torch.Tensor, radius: float, power: float) -> torch.Tensor:
-    """Attention weights of the manifold heads, softmax(-(D/r)^p) along rows (equation 1).
-
-    Args:
-        distances: Geodesic distances between face centroids [m], shape [...,N,N]; inf where there is no way.
-        radius: r [m]. A large power makes the weights a ball of this radius, a small one a smooth decay.
-        power: p.
-
-    Returns:
-        Shape [...,N,N], finite. Rows sum to one; a row whose distances are all inf (a padded one) is zero.
-    """
-    score = -((distances / radius) ** power)  # may overflow to -inf, which is weight 0 and right
-    score = torch.where(torch.isinf(distances), -math.inf, score)  # inf ** power is 1 for a power that rounds to 0
-    highest = score.amax(dim=-1, keepdim=True)
-    weight = torch.exp(score - torch.where(torch.isinf(highest), 0.0, highest))
-    return weight / weight.sum(dim=-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)
 
 
 def rotate_output(output: NetworkOutput, frame: torch.Tensor | None, *, inverse: bool = False) -> NetworkOutput:

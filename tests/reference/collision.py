@@ -1,4 +1,4 @@
-"""Float64 twin of kernels/collision.py: libigl's Laplacian and distances, and a sparse direct solve of all 3V unknowns."""
+"""Float64 twin of kernels/collision.py: libigl's Laplacian and distances, a sparse direct solve of 3V unknowns."""
 
 from __future__ import annotations
 

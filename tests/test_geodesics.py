@@ -1,0 +1,176 @@
+"""If these failed, manifold-aware attention would reach across gaps, or distances would be off by more than promised."""
+
+import numpy as np
+import pytest
+import trimesh
+from pygeodesic.geodesic import PyGeodesicAlgorithmExact
+from scipy.spatial import Delaunay
+
+import warpgarment as wg
+from warpgarment.geodesics import face_geodesics
+
+
+def sheet(columns, rows, wrap=False):
+    """Column and row of each vertex of a triangulated rectangle, and its faces; `wrap` closes it to a tube."""
+    across = columns if wrap else columns + 1
+    u, v = np.meshgrid(np.arange(across), np.arange(rows + 1), indexing="ij")
+    i, j = (n.ravel() for n in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
+    a, b = i * (rows + 1) + j, (i + 1) % across * (rows + 1) + j
+    return u.ravel(), v.ravel(), np.concatenate([np.stack([a, b, b + 1], 1), np.stack([a, b + 1, a + 1], 1)])
+
+
+def flat(columns=10, rows=10, width=1.0, height=1.0):
+    u, v, faces = sheet(columns, rows)
+    return np.stack([u * width / columns, v * height / rows, 0 * u], axis=1), faces
+
+
+def skirt(columns, rows, angle, ripple=0.0):
+    """A flared skirt; less than a full turn leaves a slit."""
+    u, v, faces = sheet(columns, rows, wrap=angle is None)
+    turn, s = u / columns * (angle or 2 * np.pi), v / rows
+    radius = 0.15 + 0.25 * s + ripple * s * np.sin(8 * turn)
+    return np.stack([radius * np.cos(turn), -0.6 * s, radius * np.sin(turn)], axis=1), faces
+
+
+def cone(around, height):
+    angle = np.arange(around) * 2 * np.pi / around
+    rim = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    i = np.arange(around)
+    return np.concatenate([[[0, height, 0]], rim]), np.stack([0 * i, (i + 1) % around + 1, i + 1], axis=1)
+
+
+def irregular(count, seed, bumps=0.0, grading=1):
+    """A hilly sheet over random points: very different edge lengths, slivers at its border."""
+    random = np.random.default_rng(seed)
+    points = random.random((count, 2)) ** grading
+    faces = Delaunay(points).simplices
+    z = 0.15 * np.sin(5 * points[:, 0]) * np.cos(4 * points[:, 1]) + random.normal(0, bumps, count)
+    corners = points[faces]
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    faces[area < 0] = faces[area < 0][:, ::-1]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    used, faces = np.unique(faces[np.abs(area) / longest > 3e-5], return_inverse=True)
+    return np.column_stack([points, z])[used], faces.reshape(-1, 3)
+
+
+def sphere():
+    mesh = trimesh.creation.icosphere(2)
+    return np.array(mesh.vertices), np.array(mesh.faces)
+
+
+def exact_distances(vertices, faces, sources):
+    """Exact polyhedral distances between centroids, float64: each face is split in three at its centroid."""
+    vertices = vertices.astype(np.float32).astype(np.float64)
+    count, middle = len(faces), len(vertices) + np.arange(len(faces))
+    points = np.concatenate([vertices, vertices[faces].mean(axis=1)])
+    split = np.concatenate([np.stack([faces[:, k], faces[:, (k + 1) % 3], middle], axis=1) for k in range(3)])
+    solver = PyGeodesicAlgorithmExact(points, split.astype(np.int32))
+    return np.stack([solver.geodesicDistances(np.array([len(vertices) + s]), middle)[0] for s in sources]).reshape(
+        -1, count
+    )
+
+
+MESHES = {
+    "flat grid": flat,
+    "long faces": lambda: flat(40, 5),
+    "slivers": lambda: flat(3, 60),
+    "strip": lambda: flat(150, 1, 2.0, 0.02),
+    "fan": lambda: cone(150, 0.2),
+    "cone": lambda: cone(40, 1.0),
+    "slit skirt": lambda: skirt(20, 8, 1.9 * np.pi),
+    "rippled skirt": lambda: skirt(24, 6, None, 0.05),
+    "irregular": lambda: irregular(150, 0),
+    "graded": lambda: irregular(180, 1, grading=3),
+    "bumpy": lambda: irregular(150, 2, bumps=0.03),
+    "sphere": sphere,
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_within_two_percent_of_exact_distances(name):
+    """Attention would reach too far or not far enough. The promise is 5 %; 2 % is what these meshes leave room for.
+
+    Sources are every sixth face and all faces are targets, adjacent ones included. Distances are lengths of real paths, so
+    they are never shorter than exact, up to float32 rounding of the sum (relative 1e-6).
+    """
+    vertices, faces = MESHES[name]()
+    sources = np.arange(0, len(faces), 6)
+    exact = exact_distances(vertices, faces, sources)
+    distances = face_geodesics(vertices, faces)
+    assert distances.dtype == np.float32
+    assert distances.shape == (len(faces), len(faces))
+    np.testing.assert_array_equal(distances, distances.T)
+    np.testing.assert_array_equal(np.diag(distances), 0)
+    others = exact > 0
+    others[np.arange(len(sources)), sources] = False
+    ratio = distances[sources][others] / exact[others]
+    assert ratio.min() > 1 - 1e-6
+    assert ratio.max() < 1.02
+
+
+def test_flat_neighbours_are_straight():
+    """On a convex flat sheet distances are Euclidean: exact to neighbours, within 1 % afar, whatever the triangles."""
+    vertices, faces = flat(12, 9)
+    centroids = vertices[faces].mean(axis=1)
+    straight = np.linalg.norm(centroids[:, None] - centroids[None], axis=-1)
+    distances = face_geodesics(vertices, faces)
+    near = straight < 0.2
+    np.testing.assert_allclose(distances[near], straight[near], rtol=1e-5, atol=1e-7)  # float32 vertices
+    np.testing.assert_allclose(distances, straight, rtol=0.01)
+
+
+def test_pieces_are_infinitely_far_apart_and_slits_are_walked_around():
+    """Attention would leak between garments, or across the two sides of a cut."""
+    vertices, faces = skirt(20, 6, 1.97 * np.pi)
+    both = face_geodesics(np.concatenate([vertices, vertices]), np.concatenate([faces, faces + len(vertices)]))
+    count = len(faces)
+    assert np.isinf(both[:count, count:]).all()
+    assert np.isfinite(both[:count, :count]).all()
+    np.testing.assert_array_equal(both[:count, :count], both[count:, count:])
+    centroids = vertices[faces].mean(axis=1)
+    gap = np.linalg.norm(centroids[:, None] - centroids[None], axis=-1)
+    hem = np.nonzero(centroids[:, 1] < centroids[:, 1].min() + 0.11)[0]
+    angle = np.arctan2(centroids[hem, 2], centroids[hem, 0]) % (2 * np.pi)
+    first, last = hem[np.argmin(angle)], hem[np.argmax(angle)]
+    assert gap[first, last] < 0.2
+    assert both[first, last] > 1.0
+
+
+def test_scale_and_renumbering_change_nothing():
+    """Distances would depend on the unit or on the order of faces."""
+    vertices, faces = irregular(80, 4)
+    base = face_geodesics(vertices, faces)
+    np.testing.assert_allclose(face_geodesics(vertices * 1000, faces), base * 1000, rtol=1e-5)  # float32 vertices
+    order = np.random.default_rng(0).permutation(len(faces))
+    np.testing.assert_allclose(
+        face_geodesics(vertices, np.roll(faces, 1, axis=1)[order]), base[np.ix_(order, order)], rtol=1e-6
+    )
+
+
+def test_patches_that_touch_in_a_vertex_are_connected_through_it():
+    """A bow tie would be torn apart, although cloth holds together there."""
+    vertices = np.array([[0, 0, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0]], dtype=float)
+    distances = face_geodesics(vertices, [[0, 1, 2], [0, 3, 4]])
+    np.testing.assert_allclose(distances[0, 1], 4 / 3, rtol=1e-6)
+
+
+def test_bad_meshes_and_too_large_ones_are_refused(monkeypatch):
+    """A 200,000-face garment would ask for 160 GB without a word."""
+    vertices, faces = flat(4, 4)
+    with pytest.raises(wg.MeshError, match="more than two faces"):
+        face_geodesics(np.r_[vertices, [[0, 0, 1]]], np.r_[faces, [[0, 6, 25]]])
+    with pytest.raises(wg.MeshError, match="no area"):
+        face_geodesics(vertices, np.r_[faces, [[0, 1, 2]]])
+    with pytest.raises(wg.MeshError, match="do not exist"):
+        face_geodesics(vertices, faces + 20)
+    monkeypatch.setattr("warpgarment.geodesics.MEMORY_BUDGET", 4000)
+    with pytest.raises(wg.MeshError, match="MEMORY_BUDGET"):
+        face_geodesics(vertices, faces)
+
+
+def test_garment_caches_its_geodesics():
+    """They would be computed again for every rollout."""
+    garment = wg.Garment(*flat(4, 4))
+    assert garment.geodesics is garment.geodesics
+    np.testing.assert_array_equal(garment.geodesics, face_geodesics(garment.vertices, garment.faces))

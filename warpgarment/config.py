@@ -1,0 +1,69 @@
+"""The settings of a network."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from warpgarment.attention import ACTIVATIONS
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Everything that is not a weight. The defaults are the paper's."""
+
+    embedding: int = 512
+    layers: int = 8
+    feed_forward: int = 512
+    heads: int = 8
+    manifold_heads: int = 2
+    dropout: float = 0.1
+    history: int = 10  # frames
+    geodesic_power: float = 20.0
+    geodesic_radius: float = 1.0  # metres
+    residual: bool = False  # see parametrisation.py
+    heading: str = "world"  # or "canonical", see heading.py
+    norm_first: bool = False
+    activation: str = "relu"  # or "gelu"
+    fps: float = 30.0  # of the motions it was trained on
+
+    def __post_init__(self) -> None:
+        for name in ("embedding", "layers", "feed_forward", "heads"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.embedding % self.heads:
+            raise ValueError(f"heads must divide embedding, got {self.heads} heads for embedding {self.embedding}")
+        if not 0 <= self.manifold_heads <= self.heads:
+            raise ValueError(f"manifold_heads must lie between 0 and heads={self.heads}, got {self.manifold_heads}")
+        if self.history < 2:
+            raise ValueError(f"history must be at least 2 frames, since velocities need two, got {self.history}")
+        if not 0.0 <= self.dropout < 1.0:
+            raise ValueError(f"dropout must lie in [0, 1), got {self.dropout}")
+        for name in ("geodesic_power", "geodesic_radius", "fps"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if self.heading not in ("world", "canonical"):
+            raise ValueError(f'heading must be "world" or "canonical", got {self.heading!r}')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
+
+    @classmethod
+    def base(cls, **changes: object) -> NetworkConfig:
+        """The paper's network, 12.8 million parameters."""
+        return cls(**changes)
+
+    @classmethod
+    def small(cls, **changes: object) -> NetworkConfig:
+        """A network for one CPU core, 0.5 million parameters."""
+        settings: dict[str, object] = {
+            "embedding": 128,
+            "layers": 4,
+            "feed_forward": 192,
+            "heads": 4,
+            "manifold_heads": 1,
+            "residual": True,
+            "heading": "canonical",
+            "norm_first": True,
+            "activation": "gelu",
+        }
+        return cls(**(settings | changes))
