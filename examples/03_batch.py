@@ -38,7 +38,9 @@ def main(out: Path = Path("out/batch"), frames: int = 60) -> None:
     print(f"{len(garments)} garments, {frames} frames: {batched:.1f} s in a batch, {one_by_one:.1f} s one by one")
     for a, b in zip(together, singly, strict=True):
         apart = np.abs(a.vertices - b.vertices).max()
-        print(f"{a.name:8} {a.frames} frames, {a.status[-1].verdict.value}, {1e3 * apart:.3f} mm from the single rollout")
+        print(
+            f"{a.name:8} {a.frames} frames, {a.status[-1].verdict.value}, {1e3 * apart:.3f} mm from the single rollout"
+        )
     for index, motion in enumerate(together):
         motion.save(out / f"{index}_{motion.name}.pc2")
     print(f"wrote {len(together)} motions to {out}")

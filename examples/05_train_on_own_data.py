@@ -1,7 +1,7 @@
 """Training on your own simulations: write them as sequences, train, roll the new network out.
 
-Here a single bundled simulation stands for yours, and a minute of training for hours: watch the loss fall, don't expect a
-good network. `warpgarment train --data DIR --out DIR` does the same from the command line.
+Here a single bundled simulation stands for yours, and a minute of training for hours: watch the loss fall, but expect
+no good network. `warpgarment train --data DIR --out DIR` does the same from the command line.
 
 python examples/05_train_on_own_data.py
 """
@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-
-import warpgarment as wg
 from warpgarment.training.dataset import write_sequence
 from warpgarment.training.pushforward import PushforwardConfig
 from warpgarment.training.train import TrainConfig, train
 
+import warpgarment as wg
+
 
 def write_own_data(folder: Path, frames: int) -> None:
-    """One folder per sequence. The body is a rest mesh with bones; a mesh without bones is given one per vertex group."""
+    """One folder per sequence: a garment's rest mesh and motion, a body's rest mesh, bones and their transforms."""
     dress = wg.demo.assets().garments["dress"]
     with np.load(wg.demo.ASSETS / "body.npz") as body:
         arrays = {
@@ -60,7 +60,9 @@ def main(out: Path = Path("out/own_training"), frames: int = 60, steps: int = 60
     assets = wg.demo.assets()
     dress = assets.garments["dress"]
     simulator = wg.Simulator.from_pretrained(path)
-    motion = simulator.rollout(dress.garment, assets.collider, first_vertices=dress.first_vertices, frames=min(frames, 20))
+    motion = simulator.rollout(
+        dress.garment, assets.collider, first_vertices=dress.first_vertices, frames=min(frames, 20)
+    )
     error = wg.metrics.mean_vertex_error(motion.vertices, dress.truth.vertices[: motion.frames])
     print(f"{path}: {error:.2f} cm from the truth after {motion.frames} frames")
 

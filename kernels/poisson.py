@@ -41,8 +41,8 @@ TOLERANCE = 3e-7
 """Error of a solve in the energy norm as a share of the rest bounding box diagonal.
 
 Measured on skirts, sheets with obtuse triangles and narrow strips of 280 to 9,600 faces, from near and far guesses:
-the worst vertex is off by up to 7e-5 of the diagonal at 1e-5, 1.4e-5 at 1e-6, and 2e-6 at 3e-7, for some 15 % more iterations
-than at 1e-5.
+the worst vertex is off by up to 7e-5 of the diagonal at 1e-5, 1.4e-5 at 1e-6, and 2e-6 at 3e-7, for some 15 % more
+iterations than at 1e-5.
 """
 ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from warpgarment import demo
 from warpgarment.training.bodies import RestBody
+
+from warpgarment import demo
 
 
 @lru_cache(maxsize=1)
@@ -21,7 +22,7 @@ def write_bvh(path: Path, joints: list[tuple[str, str | None, tuple[float, float
     Args:
         path: The file.
         joints: Name, parent (None for the root) and offset, parents first.
-        frames: Per frame the root's position followed by Z, X, Y rotations in degrees of every joint in depth-first order.
+        frames: Per frame the root's position, then Z, X, Y rotations [degrees] of every joint in depth-first order.
         fps: Frames per second.
     """
     children = {name: [j for j in joints if j[1] == name] for name, _, _ in joints}

@@ -33,7 +33,8 @@ def arrays(frames: int = 40, seed: int = 0, around: int = 12, rings: int = 6, pi
     """Arrays of one sequence. The body has two bones, feet and head; the cloth lags 2 frames behind the head."""
     rng = np.random.default_rng(seed)
     body = trimesh.creation.capsule(height=1.2, radius=0.15, count=[12, 12])
-    rest = np.asarray(body.vertices)[:, [1, 2, 0]] + [0.0, 0.3, 0.0]  # cyclic, so that the outside stays outside
+    rest = np.asarray(body.vertices)[:, [1, 2, 0]]  # cyclic, so that the outside stays outside
+    rest = rest + [0.0, 0.15 - rest[:, 1].min(), 0.0]  # from 0.15 m to 1.65 m
     share = np.clip((rest[:, 1] - 0.3) / 1.2, 0.0, 1.0)
     time = np.arange(-2, frames) / 30.0
     phase = rng.uniform(0, 2 * np.pi)

@@ -1,4 +1,4 @@
-"""If these failed, a body would be posed wrongly, or a broken one would reach the distance queries, which accept anything."""
+"""If these failed, bodies would be posed wrongly, or broken ones reach the distance queries, which take anything."""
 
 import re
 

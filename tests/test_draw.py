@@ -10,11 +10,11 @@ import meshes
 import numpy as np
 import pytest
 import warp as wp
+from warpgarment.kernels import raster, shading
 
 from warpgarment import draw
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
-from warpgarment.kernels import raster, shading
 from warpgarment.motion import GarmentMotion
 
 SIZE = 48
@@ -50,7 +50,7 @@ def _nearest_faces(vertices: np.ndarray, faces: np.ndarray, view: raster.View) -
         u = np.einsum("rfk,rfk->rf", t, p) / det
         v = np.einsum("rk,rfk->rf", direction, q) / det
         depth = np.einsum("fk,rfk->rf", e2, q) / det
-    margin = np.minimum(np.minimum(u, v), 1 - u - v)  # negative outside
+        margin = np.minimum(np.minimum(u, v), 1 - u - v)  # negative outside
     depth = np.where((margin >= 0) & (depth > 0), depth, np.inf)
     face = np.where(np.isfinite(depth).any(1), depth.argmin(1), -1)
     return face, depth.min(1), np.abs(np.nan_to_num(margin, nan=1.0)).min(1)
@@ -61,8 +61,8 @@ def _nearest_faces(vertices: np.ndarray, faces: np.ndarray, view: raster.View) -
 def test_depth_buffer_keeps_the_nearest_triangle(name: str, perspective: bool) -> None:
     """Wrong faces in front, holes or a wrong depth: the picture would show what lies behind.
 
-    Reference: every ray against every face in float64. Pixels whose ray passes within 1e-3 (barycentric) of an edge are left
-    out, since float32 may decide either way there; depth to 1e-5 relative, float32 with a few roundings.
+    Reference: every ray against every face in float64. Pixels whose ray passes within 1e-3 (barycentric) of an edge are
+    left out, since float32 may decide either way there; depth to 1e-5 relative, float32 with a few roundings.
     """
     if name == "sphere":
         mesh = meshes.icosphere(1)
@@ -135,15 +135,22 @@ def test_ball_casts_a_shadow_on_the_floor() -> None:
 
 
 def test_vertices_that_are_not_finite_leave_the_rest_of_the_picture() -> None:
-    """One NaN blanks the picture of a rollout that failed, just when it is wanted."""
+    """One NaN blanks the picture of a rollout that failed, just when it is wanted.
+
+    The vertex nearest to the camera leaves a hole in the middle of the ball, not wider than 16 of 64 pixels; elsewhere
+    the picture stays as it was, to 2 levels.
+    """
     ball = meshes.icosphere(2)
     camera = draw.Camera((0, 0, 0), 4.0)
     whole = draw.render([draw.Surface(ball.vertices, ball.faces)], camera, size=(64, 64))
     vertices = ball.vertices.copy()
-    vertices[vertices[:, 1].argmin()] = np.nan
-    broken = draw.render([draw.Surface(vertices, ball.faces)], camera, size=(64, 64))
-    np.testing.assert_array_equal(broken[:32], whole[:32])
-    assert (broken[32:] != whole[32:]).any()
+    vertices[(vertices @ camera.direction).argmax()] = np.nan
+    broken = draw.render([draw.Surface(vertices, ball.faces, lining=True)], camera, size=(64, 64))
+    changed = np.abs(broken.astype(int) - whole).max(2) > 2
+    rows, columns = np.nonzero(changed)
+    assert changed.sum() > 20
+    assert np.ptp(rows) < 16
+    assert np.ptp(columns) < 16
     with pytest.raises(ValueError, match="no surface"):
         draw.render([])
 

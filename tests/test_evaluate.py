@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import synthetic_sequences
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 from warpgarment.training import evaluate
 from warpgarment.training.baselines import kabsch, rigid, skinned
@@ -22,9 +23,11 @@ from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 
 def moving_body(frames: int, move) -> tuple[BodyMotion, Garment]:
     content = synthetic_sequences.arrays(frames=2)
-    vertices = np.stack([move(content["body_rest_vertices"].astype(np.float64), t) for t in range(frames)])
+    rest, faces = trimesh.remesh.subdivide_to_size(content["body_rest_vertices"], content["body_faces"], max_edge=0.06)
+    rest, corners = np.unique(rest.round(6), axis=0, return_inverse=True)  # join what subdividing left apart
+    vertices = np.stack([move(rest.astype(np.float64), t) for t in range(frames)])
     garment = Garment(content["garment_rest_vertices"], content["garment_faces"])
-    return BodyMotion(vertices.astype(np.float32), content["body_faces"], 30.0), garment
+    return BodyMotion(vertices.astype(np.float32), corners.reshape(-1)[faces].astype(np.int32), 30.0), garment
 
 
 def rotate(points: np.ndarray, t: int) -> np.ndarray:

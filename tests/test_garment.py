@@ -85,7 +85,7 @@ def test_bad_meshes_are_refused_with_element_count_and_a_remedy_that_works(case)
     cleaned = wg.Garment.cleaned_from(vertices, faces)
     assert igl.is_edge_manifold(cleaned.faces.astype(np.int64))
     assert igl.bfs_orient(cleaned.faces.astype(np.int64))[0].shape == cleaned.faces.shape
-    if case not in ("nan", "inf"):
+    if case not in ("nan", "inf", "three faces"):  # these lose vertices of the sphere
         np.testing.assert_array_equal(
             np.sort(np.unique(cleaned.vertices, axis=0)), np.sort(np.unique(sphere()[0], axis=0))
         )
@@ -189,7 +189,7 @@ def test_nothing_left_after_cleaning_is_an_error():
 
 
 def test_face_frames_and_laplacian_are_those_of_the_mesh():
-    """What is cached would belong to other conventions: compared with libigl, to float32 rounding of unit-size values."""
+    """What is cached would belong to other conventions: compared with libigl, to float32 rounding of unit sizes."""
     garment = wg.Garment(*sphere())
     normals = igl.per_face_normals(garment.vertices.astype(float), garment.faces.astype(np.int64), np.zeros(3))
     normals = normals[0] if isinstance(normals, tuple) else normals
@@ -304,7 +304,8 @@ def test_files_written_by_trimesh(tmp_path, suffix):
 def test_binary_ply_of_both_byte_orders_and_mixed_polygons(tmp_path, order):
     """Lists of different lengths would be read as if they were alike."""
     name = {"<": "little", ">": "big"}[order]
-    head = f"ply\nformat binary_{name}_endian 1.0\nelement vertex 5\nproperty double x\nproperty double y\nproperty double z\n"
+    head = f"ply\nformat binary_{name}_endian 1.0\nelement vertex 5\n"
+    head += "property double x\nproperty double y\nproperty double z\n"
     head += "element face 2\nproperty list uchar uint vertex_index\nend_header\n"
     points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0]])
     body = points.astype(order + "f8").tobytes()

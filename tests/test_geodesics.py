@@ -1,4 +1,4 @@
-"""If these failed, manifold-aware attention would reach across gaps, or distances would be off by more than promised."""
+"""If these failed, manifold-aware attention would reach across gaps, or distances would be off more than promised."""
 
 import numpy as np
 import pytest
@@ -73,16 +73,16 @@ def exact_distances(vertices, faces, sources):
 
 MESHES = {
     "flat grid": flat,
-    "long faces": lambda: flat(40, 5),
-    "slivers": lambda: flat(3, 60),
-    "strip": lambda: flat(150, 1, 2.0, 0.02),
-    "fan": lambda: cone(150, 0.2),
+    "long faces": lambda: flat(24, 3),
+    "slivers": lambda: flat(2, 30),
+    "strip": lambda: flat(80, 1, 2.0, 0.02),
+    "fan": lambda: cone(100, 0.2),
     "cone": lambda: cone(40, 1.0),
-    "slit skirt": lambda: skirt(20, 8, 1.9 * np.pi),
-    "rippled skirt": lambda: skirt(24, 6, None, 0.05),
-    "irregular": lambda: irregular(150, 0),
-    "graded": lambda: irregular(180, 1, grading=3),
-    "bumpy": lambda: irregular(150, 2, bumps=0.03),
+    "slit skirt": lambda: skirt(16, 6, 1.9 * np.pi),
+    "rippled skirt": lambda: skirt(24, 4, None, 0.05),
+    "irregular": lambda: irregular(110, 0),
+    "graded": lambda: irregular(110, 1, grading=3),
+    "bumpy": lambda: irregular(110, 2, bumps=0.03),
     "sphere": sphere,
 }
 
@@ -91,11 +91,11 @@ MESHES = {
 def test_within_two_percent_of_exact_distances(name):
     """Attention would reach too far or not far enough. The promise is 5 %; 2 % is what these meshes leave room for.
 
-    Sources are every sixth face and all faces are targets, adjacent ones included. Distances are lengths of real paths, so
+    Sources are every tenth face and all faces are targets, adjacent ones too. Distances are lengths of real paths, so
     they are never shorter than exact, up to float32 rounding of the sum (relative 1e-6).
     """
     vertices, faces = MESHES[name]()
-    sources = np.arange(0, len(faces), 6)
+    sources = np.arange(0, len(faces), 10)
     exact = exact_distances(vertices, faces, sources)
     distances = face_geodesics(vertices, faces)
     assert distances.dtype == np.float32

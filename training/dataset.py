@@ -60,7 +60,7 @@ class Sequence:
             try:
                 arrays[name] = np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
             except (OSError, ValueError) as error:
-                raise MeshError(f"{folder.name}: {name}.npy cannot be read ({error}). Generate the sequence again.") from error
+                raise MeshError(f"{folder.name}: {name}.npy cannot be read ({error}). Generate it again.") from error
             if arrays[name].dtype != dtype:
                 raise MeshError(f"{folder.name}: {name}.npy is {arrays[name].dtype}, not {np.dtype(dtype)}.")
         vertices, transforms = arrays["garment_vertices"], arrays["bone_transforms"]

@@ -7,6 +7,7 @@ from the lower boundary loop as a flared tube.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -67,7 +68,7 @@ def sampled_pattern(category: str, rng: np.random.Generator, faces: int) -> Patt
         flare=float(rng.uniform(0.08, 0.22)),
         ease=float(rng.uniform(0.028, 0.040) if loose else rng.uniform(0.012, 0.020)),
         neck=float(rng.uniform(0.0, 0.02)),
-        faces=int(round(faces * _SIZE[category] * rng.uniform(0.85, 1.15))),
+        faces=round(faces * _SIZE[category] * rng.uniform(0.85, 1.15)),
     )
 
 
@@ -145,7 +146,7 @@ def _with_tube(vertices: np.ndarray, faces: np.ndarray, length: float, flare: fl
         points.append(ringed)
     following = np.roll(np.arange(len(loop)), -1)
     strips = [faces]
-    for a, b in zip(rows, rows[1:], strict=False):
+    for a, b in itertools.pairwise(rows):
         strips.append(np.stack([a[following], a, b], 1))
         strips.append(np.stack([a[following], b, b[following]], 1))
     joined = np.concatenate(strips)

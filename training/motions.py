@@ -6,6 +6,7 @@ limbs onto the target's rest pose. Root translation is scaled by the ratio of le
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -190,6 +191,6 @@ def _limb_alignment(clip: Clip, body: RestBody, source, bone: str, child: str) -
 
 def _leg_ratio(clip: Clip, body: RestBody, source) -> float:
     bones = ("LeftUpLeg", "LeftLeg", "LeftFoot")
-    target = sum(np.linalg.norm(body.joint(b) - body.joint(a)) for a, b in zip(bones, bones[1:], strict=False))
+    target = sum(np.linalg.norm(body.joint(b) - body.joint(a)) for a, b in itertools.pairwise(bones))
     own = sum(np.linalg.norm(clip.offsets[clip.names.index(source[b])]) for b in bones[1:])
     return float(target / own)

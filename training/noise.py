@@ -35,8 +35,8 @@ class NoiseConfig:
         features: Standard deviation sigma_n of the paper's Gaussian noise on the normalised input features.
     """
 
-    position: float = 0.004
-    offset: float = 0.004
+    position: float = 0.002
+    offset: float = 0.002
     walk: float = 0.1
     spread: float = 0.1
     clean: float = 0.1

@@ -29,6 +29,7 @@ from warpgarment.kernels.deformation import (
     singular_values,
 )
 from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.laplacian import components
 from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached, unpack
 from warpgarment.training.noise import NoiseBasis, NoiseConfig
 
@@ -141,8 +142,6 @@ def _writable(array: np.ndarray) -> np.ndarray:
 
 
 def _components(vertex_count: int, faces: np.ndarray) -> tuple[np.ndarray, int]:
-    from warpgarment.kernels.laplacian import components
-
     vertex_component, _, count = components(vertex_count, np.asarray(faces))
     return np.asarray(vertex_component), int(count)
 

@@ -90,3 +90,12 @@ def known_frames(
             raise MeshError(f"{name} of garment {number} holds NaN or infinity; repair what wrote it")
         parts.append(array.reshape(-1, len(garment.vertices), 3))
     return np.concatenate(parts, axis=1)
+
+
+def counted(frames: range, progress: bool) -> Any:
+    """The frames, with a progress bar if wanted."""
+    if not progress:
+        return frames
+    from tqdm import tqdm
+
+    return tqdm(frames, desc="rollout", unit="frame")

@@ -303,5 +303,5 @@ def _middle(motion: Motion, width: int = 9) -> np.ndarray:
     """Centre of the bounding box [T, 3], averaged over `width` frames: the camera glides over the bobbing of steps."""
     vertices = np.nan_to_num(motion.vertices)
     centre = (vertices.min(1) + vertices.max(1)) / 2
-    padded = np.pad(centre, ((width // 2, width // 2), (0, 0)), mode="edge")
+    padded = np.pad(centre, ((width // 2, width // 2), (0, 0)), mode="reflect", reflect_type="odd")
     return np.stack([np.convolve(column, np.full(width, 1 / width), mode="valid") for column in padded.T], axis=1)

@@ -18,8 +18,8 @@ from .kernels.sdf import BodyMeshes
 from .mesh_checks import checked_faces, checked_positions, to_numpy
 
 NEAREST = 48  # body faces that a garment vertex listens to
-SMOOTHING = 30  # averaging passes over the garment's edges
-ATTACHMENT = 0.1  # length [m] over which the garment may drift from its carried position to avoid stretch
+SMOOTHING = 0.08  # radius [m] over which motions are averaged; wider drags the garment into a bent body
+ATTACHMENT = 0.2  # length [m] over which the garment may drift from its carried position to avoid stretch
 CONTACT = 0.002  # the same for vertices pushed out of the body
 ROUNDS = 12  # local-global rounds
 MOST_CLEARANCE = 0.02  # clearance of the rest pose beyond this is not kept [m]
@@ -139,7 +139,8 @@ def _smooth(garment: Garment, transforms: np.ndarray) -> np.ndarray:
     graph = coo_matrix((ones, (np.r_[i, j], np.r_[j, i])), shape=(count, count)).tocsr() + diags(np.ones(count))
     average = diags(1.0 / np.asarray(graph.sum(axis=1)).reshape(-1)) @ graph
     flat = transforms.reshape(count, 12)
-    for _ in range(SMOOTHING):
+    edge = np.linalg.norm(garment.vertices[i] - garment.vertices[j], axis=1).mean()
+    for _ in range(int(np.clip((SMOOTHING / edge) ** 2, 1, 100))):  # each pass spreads by about an edge
         flat = average @ flat
     return flat.reshape(count, 3, 4)
 

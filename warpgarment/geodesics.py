@@ -24,7 +24,7 @@ from .errors import MeshError
 from .mesh_checks import check_edges, checked_faces, checked_positions, complain, no_area, repeated_vertices
 
 REACH = 2.5  # windows end this many times the source's longest edge away,
-CROSSED_REACH = 1.5  # or this many times the longest edge of any face crossed, which small faces need to see past large ones,
+CROSSED_REACH = 1.5  # or this many times the longest edge of any face crossed, for small faces to see past large ones,
 LEAST_DEPTH = 4  # but not before they have crossed this many faces,
 DEPTH = 400  # and in any case after this many
 SADDLE = 1e-3  # angle beyond 2 pi from which a vertex can bend a shortest path [rad]

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from warpgarment import checkpoint
-from warpgarment.arguments import as_array, known_frames, listed, per_garment
+from warpgarment.arguments import as_array, counted, known_frames, listed, per_garment
 from warpgarment.batch import PackedBodies
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
@@ -141,7 +141,7 @@ class Simulator:
         sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, garments, strict=True)]
         positions = [np.full(size, np.nan, np.float32) for size in sizes]
         statuses: list[list[RolloutStatus]] = [[] for _ in garments]
-        for frame in _counted(range(total), progress):
+        for frame in counted(range(total), progress):
             if frame < given:
                 state = states[frame]
             else:
@@ -190,8 +190,8 @@ class Simulator:
         if isinstance(body_vertices, (list, tuple)):
             if len(body_vertices) != len(garments) or len(body_faces) != len(garments):
                 raise ValueError(
-                    f"{len(garments)} garments, {len(body_vertices)} bodies and {len(body_faces)} arrays of body faces; "
-                    "give one of each per garment, or one body for all"
+                    f"{len(garments)} garments, {len(body_vertices)} bodies and {len(body_faces)} arrays of body "
+                    "faces; give one of each per garment, or one body for all"
                 )
             shapes, faces, on = list(body_vertices), list(body_faces), list(range(len(garments)))
         else:
@@ -295,11 +295,3 @@ class Simulator:
     def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
         """Arrays [*,3] end to end on the device; always a copy, so that callers may reuse theirs."""
         return torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False)).to(self.device)
-
-
-def _counted(frames: range, progress: bool) -> Any:
-    if not progress:
-        return frames
-    from tqdm import tqdm
-
-    return tqdm(frames, desc="rollout", unit="frame")

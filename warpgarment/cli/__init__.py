@@ -91,23 +91,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name not in VERBS:
         return _complain(f"there is no verb {arguments[0]!r}. Verbs: {', '.join(VERBS)}.")
 
-    from ..errors import CheckpointError, MeshError, MissingExtra
-
     verb = VERBS[name]
     try:
         options = _options(verb, name, arguments[1:])
         getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.function)(options)
-    except (MeshError, CheckpointError, MissingExtra, UsageError) as error:
-        return _complain(f"{type(error).__name__}: {error}")
     except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
         return _complain(f"{type(error).__name__}: {error}")
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
             raise
+        from ..errors import MissingExtra
+
         return _complain(f"MissingExtra: {MissingExtra(extra, f'warpgarment {name}')}")
     except KeyboardInterrupt:
         return 130
+    except Exception as error:
+        if not type(error).__module__.startswith(_ROOM):
+            raise  # not one of the errors that name a remedy: somebody has to see where it came from
+        return _complain(f"{type(error).__name__}: {error}")
     return 0
 
 
@@ -129,7 +131,7 @@ def _options(verb: Verb, name: str, arguments: Sequence[str]) -> object:
     import tyro
 
     config = getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.options)
-    return tyro.cli(config, prog=f"warpgarment {name}", args=list(arguments), description=f"{verb.summary}")
+    return tyro.cli(config, prog=f"warpgarment {name}", args=list(arguments), description=verb.summary)
 
 
 def _complain(message: str) -> int:

@@ -51,7 +51,7 @@ def run(options: Simulate) -> None:
     simulator.timings.synchronise = True
     first = None
     if options.fit_rest is not None:
-        from ..fit import fit
+        from ..fitting import fit
 
         whole = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh, collider=False)
         rest = BodyMotion.load(options.fit_rest, unit=options.body_unit, collider=False)

@@ -33,7 +33,7 @@ def read_npz(path: Path, required: Sequence[str] = ()) -> dict[str, np.ndarray]:
         raise
     except MeshError:
         raise
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, TypeError, AttributeError) as error:
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, TypeError, AttributeError):
         raise MeshError(
             f"{path}: not a readable .npz archive of plain arrays. It is damaged, cut short, or of another kind."
         ) from None

@@ -1,0 +1,61 @@
+"""The scene that is timed: the bundled dress and walk, remeshed to a number of faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import igl
+import numpy as np
+from gpytoolbox import remesh_botsch
+from warpgarment.training.mesh_cutting import without_short_edges
+
+from warpgarment import demo
+from warpgarment.body import BodyMotion
+from warpgarment.garment import Garment
+
+
+@dataclass(frozen=True)
+class Dressed:
+    """A garment and two frames of it on a moving body, and the first frame pressed 6 mm into the body."""
+
+    garment: Garment
+    body: BodyMotion
+    first: np.ndarray
+    second: np.ndarray
+    pressed: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def dressed(faces: int, name: str = "dress", start: int = 40) -> Dressed:
+    """The bundled garment with about `faces` faces, carried along by barycentric coordinates."""
+    bundle = demo.assets()
+    item = bundle.garments[name]
+    rest, old = item.garment.vertices.astype(np.float64), item.garment.faces.astype(np.int64)
+    area = 0.5 * np.asarray(igl.doublearea(rest, old)).sum()
+    edge = float(np.sqrt(area * 4.0 / (np.sqrt(3.0) * faces)))
+    vertices, triangles = remesh_botsch(rest, old.astype(np.int32), i=10, h=edge, project=True)
+    vertices, triangles = without_short_edges(vertices, triangles, 0.3 * edge)
+    _, nearest, closest = igl.point_mesh_squared_distance(vertices, rest, old)
+    corners = [rest[old[nearest, k]] for k in range(3)]
+    weights = np.asarray(igl.barycentric_coordinates(closest, *corners)).reshape(-1, 3)
+
+    def carried(frame: np.ndarray) -> np.ndarray:
+        return np.einsum("vk,vkc->vc", weights, frame.astype(np.float64)[old[nearest]]).astype(np.float32)
+
+    motion = bundle.collider
+    moving = BodyMotion(motion.vertices[start:], motion.faces, motion.fps)
+    first, second = carried(item.truth.vertices[start]), carried(item.truth.vertices[start + 1])
+    distance, _, point, *_ = igl.signed_distance(
+        first.astype(np.float64),
+        moving.vertices[0].astype(np.float64),
+        moving.faces.astype(np.int64),
+        sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
+    )
+    near = (np.asarray(distance) < 0.03)[:, None]
+    inward = np.asarray(point) - first
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True) + 1e-12
+    depth = np.minimum(np.asarray(distance), 0.03)[:, None] + 0.006
+    pressed = (first + np.where(near, inward * depth, 0.0)).astype(np.float32)
+    garment = Garment(vertices.astype(np.float32), triangles.astype(np.int32), name=f"{name}_{faces}")
+    return Dressed(garment, moving, first, second, pressed)
