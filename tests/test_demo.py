@@ -20,7 +20,7 @@ def bundle() -> demo.DemoAssets:
 def test_assets_fit_together(bundle) -> None:
     """Garments of other lengths than the body, or draped somewhere else: nothing would line up.
 
-    Every garment vertex starts within 30 cm of the body, and at least 150 frames can be compared.
+    Every garment vertex is within 40 cm of the body, and at least 150 frames can be compared.
     """
     assert set(bundle.garments) == {"dress", "tshirt"}
     assert bundle.collider.frames == bundle.body.frames >= 150
@@ -30,7 +30,7 @@ def test_assets_fit_together(bundle) -> None:
         assert np.isfinite(item.truth.vertices).all()
         for t in (0, 100):
             apart = np.linalg.norm(item.truth.vertices[t][:, None] - bundle.body.vertices[t][None], axis=-1).min(1)
-            assert apart.max() < 0.30
+            assert apart.max() < 0.40
 
 
 def test_demo_writes_what_it_prints(tmp_path, capsys, bundle) -> None:
