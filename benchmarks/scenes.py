@@ -8,11 +8,11 @@ from functools import lru_cache
 import igl
 import numpy as np
 from gpytoolbox import remesh_botsch
-from warpgarment.training.mesh_cutting import without_short_edges
 
 from warpgarment import demo
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
+from warpgarment.training.mesh_cutting import without_short_edges
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 import torch
+
 from warpgarment.kernels import deformation, sdf
 from warpgarment.kernels.collision import CollisionSolver
 from warpgarment.kernels.features import body_interaction, face_features

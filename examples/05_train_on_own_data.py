@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+
+import warpgarment as wg
 from warpgarment.training.dataset import write_sequence
 from warpgarment.training.pushforward import PushforwardConfig
 from warpgarment.training.train import TrainConfig, train
-
-import warpgarment as wg
 
 
 def write_own_data(folder: Path, frames: int) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from warpgarment.training.bodies import RestBody
-
 from warpgarment import demo
+from warpgarment.training.bodies import RestBody
 
 
 @lru_cache(maxsize=1)

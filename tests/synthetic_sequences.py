@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+
 from warpgarment.training.dataset import write_sequence
 
 

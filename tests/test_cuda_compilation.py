@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+
 import warpgarment.kernels
 
 ARCHITECTURE = 90  # an H100

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from data_bodies import rest_body
-from warpgarment.training import dataset
-from warpgarment.training.generate import GenerateConfig, plan_sequence, split_of_clips
-from warpgarment.training.quality import Limits, QualityGate
 
 from warpgarment import demo
 from warpgarment.errors import MeshError
 from warpgarment.garment import Garment
+from warpgarment.training import dataset
+from warpgarment.training.generate import GenerateConfig, plan_sequence, split_of_clips
+from warpgarment.training.quality import Limits, QualityGate
 
 
 def _write(folder: Path) -> dict[str, np.ndarray]:

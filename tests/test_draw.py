@@ -10,11 +10,11 @@ import meshes
 import numpy as np
 import pytest
 import warp as wp
-from warpgarment.kernels import raster, shading
 
 from warpgarment import draw
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
+from warpgarment.kernels import raster, shading
 from warpgarment.motion import GarmentMotion
 
 SIZE = 48

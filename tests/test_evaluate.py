@@ -10,15 +10,15 @@ import synthetic_sequences
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
-from warpgarment.training import evaluate
-from warpgarment.training.baselines import kabsch, rigid, skinned
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.evaluate import EvaluateConfig, NoTestData
 
 from warpgarment import checkpoint
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
 from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.training import evaluate
+from warpgarment.training.baselines import kabsch, rigid, skinned
+from warpgarment.training.dataset import Sequence
+from warpgarment.training.evaluate import EvaluateConfig, NoTestData
 
 
 def moving_body(frames: int, move) -> tuple[BodyMotion, Garment]:

@@ -6,6 +6,7 @@ import igl
 import numpy as np
 import pytest
 from data_bodies import rest_body
+
 from warpgarment.training.garments import CATEGORIES, make_garment, sampled_pattern
 from warpgarment.training.mesh_cutting import boundary_loops, cut_below_zero, without_short_edges
 

@@ -9,6 +9,7 @@ import torch
 import warp as wp
 from poison import poison_outputs
 from reference import collision as reference
+
 from warpgarment.kernels import collision, compliance
 from warpgarment.kernels.body_meshes import BodyMeshes
 

@@ -8,6 +8,7 @@ import torch
 from poison import poison_outputs
 from reference import deformation as reference
 from reference.finite_differences import numeric_gradient
+
 from warpgarment.kernels import deformation
 from warpgarment.kernels.singular_values import MAX_GAIN
 

@@ -9,6 +9,7 @@ from reference import deformation as reference_deformation
 from reference import features as reference
 from reference import signed_distance as reference_distance
 from reference.finite_differences import numeric_gradient
+
 from warpgarment.kernels import deformation, features, sdf
 
 GARMENTS = meshes.garments()

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from poison import poison_outputs
 from reference import poisson as reference
+
 from warpgarment.kernels import cg, laplacian
 from warpgarment.kernels.poisson import PoissonSolver
 

@@ -7,6 +7,7 @@ import torch
 from poison import poison_outputs
 from reference import signed_distance as reference
 from reference.finite_differences import numeric_gradient
+
 from warpgarment.kernels import sdf
 
 BODIES = meshes.bodies()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from data_bodies import rest_body, write_bvh
 from scipy.spatial.transform import Rotation
-from warpgarment.training import skeleton
-from warpgarment.training.motions import read_bvh, retarget
-from warpgarment.training.procedural import KINDS, procedural
 
 from warpgarment.errors import MeshError
 from warpgarment.skinning import linear_blend_skinning
+from warpgarment.training import skeleton
+from warpgarment.training.motions import read_bvh, retarget
+from warpgarment.training.procedural import KINDS, procedural
 
 ARM = [("Hips", None, (0.0, 0.0, 0.0)), ("Spine", "Hips", (0.0, 2.0, 0.0)), ("Head", "Spine", (0.0, 3.0, 0.0))]
 

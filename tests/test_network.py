@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import scipy.special
 import torch
-from warpgarment.kernels.deformation import face_centroids, inverse_rest_frames, segment_mean
-from warpgarment.kernels.features import FEATURES, body_interaction, face_features
-from warpgarment.kernels.sdf import BodyMeshes
 
 from warpgarment import heading
 from warpgarment.attention import EncoderLayer, ManifoldAwareAttention
+from warpgarment.kernels.deformation import face_centroids, inverse_rest_frames, segment_mean
+from warpgarment.kernels.features import FEATURES, body_interaction, face_features
+from warpgarment.kernels.sdf import BodyMeshes
 from warpgarment.network import (
     STATISTICS,
     ManifoldAwareTransformer,

@@ -12,12 +12,12 @@ import scipy.sparse.linalg
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
-from warpgarment.kernels.sdf import BodyMeshes
 
 from warpgarment.batch import PackedGarments, padded_views
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
 from warpgarment.garment import Garment
+from warpgarment.kernels.sdf import BodyMeshes
 from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 from warpgarment.pins import BodyPins, barycentric_coordinates
 from warpgarment.simulator import Simulator

@@ -6,9 +6,9 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from warpgarment.training.teacher import ClothSettings, simulate
 
 from warpgarment.garment import Garment
+from warpgarment.training.teacher import ClothSettings, simulate
 
 
 def _sheet(size: float, cells: int, height: float) -> tuple[Garment, float]:

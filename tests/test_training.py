@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 import synthetic_sequences
 import torch
+
+from warpgarment import checkpoint
 from warpgarment.kernels.deformation import deformation_gradient
 from warpgarment.kernels.features import FEATURES, LAYOUT, body_interaction, face_features
 from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, geodesic_weights, rotate_output
+from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.training import interactions, train
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.losses import LossConfig, loss
 from warpgarment.training.noise import NoiseBasis, NoiseConfig
 from warpgarment.training.pushforward import Pool, PushforwardConfig
 from warpgarment.training.samples import Augmentation, SampleBuilder, SequenceData, mirror
-
-from warpgarment import checkpoint
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, geodesic_weights, rotate_output
-from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.1, geodesic_radius=0.2)
 SHAPE = ("embedding=16", "layers=1", "feed_forward=16", "heads=2", "geodesic_radius=0.2")

@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from trimesh.triangles import closest_point, points_to_barycentric
-from warpgarment.kernels.deformation import deformation_gradient, rotation
-from warpgarment.kernels.laplacian import components
 
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
+from warpgarment.kernels.deformation import deformation_gradient, rotation
+from warpgarment.kernels.laplacian import components
 
 NEIGHBOURS = 8
 SMOOTHING = 0.03  # metres

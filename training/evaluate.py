@@ -23,14 +23,14 @@ from typing import Any
 
 import numpy as np
 from tqdm import tqdm
-from warpgarment.training.baselines import rigid, skinned
-from warpgarment.training.dataset import Sequence, list_sequences
-from warpgarment.training.rollouts import predict
 
 from warpgarment import checkpoint, metrics
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
 from warpgarment.simulator import Simulator
+from warpgarment.training.baselines import rigid, skinned
+from warpgarment.training.dataset import Sequence, list_sequences
+from warpgarment.training.rollouts import predict
 
 METHODS = ("network", "skinned", "rigid")
 STARTS = ("warm", "cold")

@@ -26,11 +26,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
+import warpgarment
 from warpgarment.kernels.deformation import face_centroids
 from warpgarment.kernels.features import BodyInteraction, body_interaction
 from warpgarment.kernels.sdf import BodyMeshes
-
-import warpgarment
 
 CACHE_VERSION = 1
 WIDTH = 16

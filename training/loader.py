@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 
 import numpy as np
+
 from warpgarment.training.pushforward import Pool
 from warpgarment.training.samples import Batch, SampleBuilder
 

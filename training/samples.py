@@ -22,6 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+
+from warpgarment.body import BodyMotion
+from warpgarment.heading import rotation_about_up, yaw
 from warpgarment.kernels.deformation import (
     deformation_gradient_from_inverse,
     inverse_rest_frames,
@@ -30,12 +33,9 @@ from warpgarment.kernels.deformation import (
 )
 from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
 from warpgarment.kernels.laplacian import components
+from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached, unpack
 from warpgarment.training.noise import NoiseBasis, NoiseConfig
-
-from warpgarment.body import BodyMotion
-from warpgarment.heading import rotation_about_up, yaw
-from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 
 MIRROR = torch.tensor([-1.0, 1.0, 1.0])
 MIRROR_MATRIX = torch.outer(MIRROR, MIRROR).flatten()

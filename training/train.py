@@ -23,7 +23,11 @@ from typing import Literal
 import numpy as np
 import torch
 from tqdm import tqdm
+
+from warpgarment import checkpoint
 from warpgarment.kernels.features import FEATURES
+from warpgarment.metrics import mean_vertex_error
+from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 from warpgarment.training import state as training_state
 from warpgarment.training.dataset import Sequence, list_sequences
 from warpgarment.training.interactions import default_cache
@@ -33,10 +37,6 @@ from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.pushforward import Pool, PushforwardConfig
 from warpgarment.training.rollouts import predict
 from warpgarment.training.samples import Augmentation, Batch, SampleBuilder, SequenceData
-
-from warpgarment import checkpoint
-from warpgarment.metrics import mean_vertex_error
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 
 
 class NoTrainingData(ValueError):

@@ -151,7 +151,7 @@ def find(name: str | os.PathLike[str]) -> Path:
     if path.is_file():
         return path
     if path.is_dir():
-        files = sorted(path.glob("*.safetensors"))
+        files = sorted(path.glob("best.safetensors")) or sorted(path.glob("*.safetensors"))  # best: a training run's
         if len(files) != 1:
             names = ", ".join(file.name for file in files) or "none"
             raise CheckpointError(f"{path}: a folder must hold one .safetensors file, found {names}; name the file")

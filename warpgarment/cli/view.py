@@ -66,7 +66,7 @@ def _window(body: BodyMotion | None, garments: list[GarmentMotion]) -> None:
     try:
         import pyvista
     except ModuleNotFoundError as error:
-        raise MissingExtra("view", "A window (without --out)") from error
+        raise MissingExtra("window", "A window (without --out)") from error
     plotter = pyvista.Plotter(title="warpgarment")
     shown = []
     for motion, color in [
