@@ -155,7 +155,6 @@ def test_one_step_matches_a_float64_twin(residual):
         bodies = BodyMeshes(torch.from_numpy(motion.vertices[0]), torch.from_numpy(motion.faces))
         nearest = bodies.query(torch.from_numpy(first[faces].mean(axis=1))).face.numpy()
         psi = psi @ Rotation.from_rotvec([0.1, 0.2, 0]).as_matrix()
-        sigma = sigma + np.linalg.svd(phi)[1]
         moved = (then - now)[motion.faces[nearest]].mean(axis=1)
         velocity = velocity + np.stack([moved[component == c].mean(axis=0) for c in range(2)])
     u, _, vt = np.linalg.svd(psi @ phi)

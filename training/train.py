@@ -450,7 +450,7 @@ def statistics(batches, network: ManifoldAwareTransformer) -> dict[str, torch.Te
     for name, parts in samples.items():
         values = torch.cat(parts).double()
         mean = values.mean(dim=0)
-        if network.config.residual and name in ("psi", "singular_value", "q"):
+        if network.config.residual and name in ("psi", "q"):
             mean = torch.eye(3, dtype=torch.float64).flatten() if name == "psi" else torch.zeros(3, dtype=torch.float64)
         deviation = (values - mean.to(values.device)).square().mean(dim=0).sqrt()
         found[f"{name}_mean"] = mean.float()

@@ -84,8 +84,8 @@ def rotate_output(output: NetworkOutput, frame: torch.Tensor | None, *, inverse:
 class ManifoldAwareTransformer(nn.Module):
     """Predicts how each face deforms in the next frame.
 
-    A residual network (`config.residual`) starts with zero output weights and statistics whose means are identity and
-    zero: untrained, it moves the garment like skin. Keep those means when setting statistics; `set_statistics` checks.
+    A residual network (`config.residual`) starts with zero output weights; the means of its Psi and q are identity and
+    zero, so that, untrained, it moves the garment like skin. `set_statistics` keeps those means.
 
     Args:
         config: Its shape and settings; `NetworkConfig.base()` and `.small()` are the named ones.
@@ -119,8 +119,7 @@ class ManifoldAwareTransformer(nn.Module):
             for head in (self.face_head, self.velocity_head):
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
-        else:
-            self.singular_value_mean.fill_(1.0)
+        self.singular_value_mean.fill_(1.0)
 
     def forward(
         self,
@@ -238,7 +237,7 @@ class ManifoldAwareTransformer(nn.Module):
                 raise ValueError(f"{name} is not finite")
             if name.endswith("_std") and (value <= 0.0).any():
                 raise ValueError(f"{name} must be positive, smallest is {value.min().item():g}")
-            if self.config.residual and name in ("psi_mean", "singular_value_mean", "q_mean"):
+            if self.config.residual and name in ("psi_mean", "q_mean"):
                 skin = torch.eye(3).flatten() if name == "psi_mean" else torch.zeros(3)
                 if not torch.equal(value.cpu(), skin):
                     raise ValueError(f"{name} of a residual network stays {skin.tolist()}, so that zero means skin")

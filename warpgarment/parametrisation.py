@@ -4,10 +4,11 @@ The network's setting `residual` chooses one of two, and both can express every 
 
     False (the paper)    Psi, Sigma and q are the output
     True                 Psi   = Psi_out R_i            R_i  rotation of the deformation of face i's nearest body face
-                         Sigma = Sigma_out + Sigma_i^t   Sigma_i^t  singular values of the newest frame
+                         Sigma = Sigma_out               (not relative: stretch must not accumulate)
                          q     = q_out + u_c             u_c  mean velocity of the body faces nearest to component c
 
-So a residual output of (identity, 0, 0), which is what an untrained residual network gives, means "moves like skin".
+So a residual output of identity and q = 0, which is what an untrained residual network gives, means "moves like skin",
+with the stretch its statistics call usual (none, before training).
 
 `compose` and `targets` are inverses of each other, and work on padded [B,N,...] and packed [F,...] arrays alike.
 """
@@ -42,7 +43,6 @@ class StepContext(NamedTuple):
     """What of the newest frame the parametrisation refers to."""
 
     body_rotation: torch.Tensor  # R_i, [..., N,3,3]
-    singular_values: torch.Tensor  # of the newest frame, [..., N,3]
     body_velocity: torch.Tensor  # u_c, [..., C,3] metres per frame
 
 
@@ -95,7 +95,7 @@ def context(
     shape = deformation.shape[:-1]
     body_rotation = rotation(deformation.reshape(-1, 3, 3).contiguous()).reshape(*shape, 3, 3)
     velocity = component_mean(newest[..., LAYOUT["body_velocity"]], face_component, count, face_mask)
-    return StepContext(body_rotation, newest[..., LAYOUT["singular_values"]], velocity)
+    return StepContext(body_rotation, velocity)
 
 
 def compose(output: NetworkOutput, context: StepContext, *, residual: bool) -> Step:
@@ -113,7 +113,7 @@ def compose(output: NetworkOutput, context: StepContext, *, residual: bool) -> S
         return Step(*output)
     return Step(
         output.psi @ context.body_rotation,
-        output.singular_values + context.singular_values,
+        output.singular_values,
         output.velocity + context.body_velocity,
     )
 
@@ -124,6 +124,6 @@ def targets(step: Step, context: StepContext, *, residual: bool) -> NetworkOutpu
         return NetworkOutput(*step)
     return NetworkOutput(
         step.psi @ context.body_rotation.mT,
-        step.singular_values - context.singular_values,
+        step.singular_values,
         step.velocity - context.body_velocity,
     )

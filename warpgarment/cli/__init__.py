@@ -19,7 +19,7 @@ _EXTRAS = {
     "anny": "bodies",
     "mannequin": "bodies",
     "pxr": "usd",
-    "pyvista": "view",
+    "pyvista": "window",
     "imageio": "view",
     "imageio_ffmpeg": "view",
     "PIL": "view",
