@@ -25,6 +25,8 @@ The gradient with respect to Ṽ is the adjoint for fixed contacts: V = Ṽ - A�
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import scipy.sparse
 import torch
@@ -305,7 +307,7 @@ class CollisionSolver:
         bodies: BodyMeshes,
         body_of_vertex: torch.Tensor | None = None,
         *,
-        epsilon: float = 0.004,
+        epsilon: float | torch.Tensor = 0.004,
         passes: int = 1,
         tolerance: float = TOLERANCE,
     ) -> torch.Tensor:
@@ -317,7 +319,7 @@ class CollisionSolver:
             vertices: Predicted positions [m], float32 [V,3].
             bodies: The bodies in the frame of `vertices`.
             body_of_vertex: Body of each vertex, int32 [V]; None where there is one body.
-            epsilon: Distance kept from the body [m].
+            epsilon: Distance kept from the body [m]: a number, or float32 [V] with one for each vertex.
             passes: How often detection and solve are done, each from the result of the one before.
             tolerance: Where the iteration stops: error in the energy norm [m]. The default keeps every vertex within
                 0.02 mm of the exact minimiser.
@@ -332,7 +334,10 @@ class CollisionSolver:
         expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
         if body_of_vertex is not None:
             expect("body_of_vertex", body_of_vertex, (self.vertex_count,), torch.int32, self.device)
-        if not epsilon >= 0:
+        each = isinstance(epsilon, torch.Tensor)
+        if isinstance(epsilon, torch.Tensor):
+            expect("epsilon", epsilon, (self.vertex_count,), device=self.device)
+        elif not epsilon >= 0:
             raise ValueError(f"epsilon must not be negative, got {epsilon}")
         if not tolerance > 0:
             raise ValueError(f"tolerance must be positive, got {tolerance}")
@@ -341,11 +346,14 @@ class CollisionSolver:
         limit = torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
         for number in range(passes):
             query = bodies.query(vertices.detach(), body_of_vertex)
-            closest, normal = contacts(vertices, query.distance, query.face, bodies, epsilon)
+            closest, normal = contacts(vertices, query.distance, query.face, bodies, math.inf if each else epsilon)
+            if isinstance(epsilon, torch.Tensor):  # n.(V - U) - e = n.(V - (U + e n)), so the solver's epsilon is zero
+                normal = torch.where((query.distance < epsilon)[:, None], normal, 0.0)
+                closest = closest + epsilon[:, None] * normal
             if number == 0:
                 self._contacts = torch.count_nonzero((normal != 0).any(dim=1))
             vertices, report, error = torch.ops.warpgarment.collision_solve(
-                vertices, normal, closest, epsilon, limit, self._model, self.max_iterations
+                vertices, normal, closest, 0.0 if each else epsilon, limit, self._model, self.max_iterations
             )
             self._progress.record(report, error, self.max_iterations, add=number > 0)
         return vertices

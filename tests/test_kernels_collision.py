@@ -89,6 +89,25 @@ def test_weights_and_epsilon_reach_the_energy(weights):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
+def test_a_distance_for_each_vertex(solver):
+    """Coarse and fine garments of a batch would keep the same distance from the body."""
+    rest, body = meshes.skirt(24, 8, waist=0.17), ellipsoid()
+    vertices = moved(rest)
+    epsilon = np.linspace(0.001, 0.015, len(vertices)).astype(np.float32)
+    index, closest, normals = reference.contacts(vertices, body.vertices, body.faces, 0.015)
+    depth = ((vertices[index] - closest) * normals).sum(1)
+    near = depth < epsilon[index]
+    assert 5 < near.sum() < len(near)
+    index, closest, normals = index[near], closest[near], normals[near]
+    exact = reference.refine(vertices, rest.vertices, rest.faces, index, closest, normals, epsilon[index])
+    refiner = solver_for(rest, **SOLVERS[solver])
+    result = refiner.refine(torch.tensor(vertices), body_of(body), epsilon=torch.tensor(epsilon)).numpy()
+    assert np.abs(result - exact).max() < TOLERANCE
+    with pytest.raises(ValueError, match="epsilon must have shape"):
+        refiner.refine(torch.tensor(vertices), body_of(body), epsilon=torch.zeros(3))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_nothing_moves_without_contact(solver):
     """A garment that is clear of the body, and of another garment that isn't, comes back to the last bit."""
     far = meshes.Mesh(meshes.skirt(24, 8).vertices + np.float32([3.0, 0.0, 0.0]), meshes.skirt(24, 8).faces)

@@ -460,3 +460,13 @@ def test_pretrained_networks_are_the_saved_ones(tmp_path):
     assert made.training  # dropout was off for the simulation, and is on again
     assert set(sim.timings) == {"signed distance", "features", "network", "singular values", "poisson", "collision"}
     assert all(seconds > 0 for seconds in sim.timings.values())
+
+
+def test_coarse_garments_keep_more_distance():
+    """A body would show through between the vertices of coarse cloth. A fifth of the mean edge, at least 4 mm."""
+    from warpgarment.scene import clearance
+
+    vertices, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]]), np.array([[0, 1, 2]])
+    mean = (2.0 + np.sqrt(2.0)) / 3.0
+    assert clearance(Garment(vertices * 0.06, faces)) == pytest.approx(0.2 * 0.06 * mean, rel=1e-5)
+    assert clearance(Garment(vertices * 0.01, faces)) == 0.004

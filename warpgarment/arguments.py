@@ -74,6 +74,7 @@ def known_frames(
         raise ValueError("give first_vertices or history, not both: a history begins with the first frame")
     if first_vertices is None and history is None:
         return np.concatenate([garment.vertices for garment in garments])[None]
+    frames: tuple[int, ...]
     name, given, frames = "history", history, (history_length,)
     if history is None:
         name, given, frames = "first_vertices", first_vertices, ()

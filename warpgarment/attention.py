@@ -12,12 +12,13 @@ Tokens are N faces followed by C velocity tokens. In a manifold head faces liste
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-ACTIVATIONS = {"relu": F.relu, "gelu": F.gelu}
+ACTIVATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"relu": F.relu, "gelu": F.gelu}
 
 
 def geodesic_weights(distances: torch.Tensor, radius: float, power: float) -> torch.Tensor:

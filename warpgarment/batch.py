@@ -42,7 +42,9 @@ class PackedGarments:
     @classmethod
     def pack(cls, garments: Sequence[Garment], device: torch.device) -> PackedGarments:
         """Packs garments in the order given."""
-        vertex_component, face_component, counts = [], [], []
+        vertex_component: list[np.ndarray] = []
+        face_component: list[np.ndarray] = []
+        counts: list[int] = []
         for garment in garments:
             of_vertex, of_face, count = components(len(garment.vertices), garment.faces)
             vertex_component.append(np.asarray(of_vertex) + sum(counts))

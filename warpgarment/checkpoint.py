@@ -12,6 +12,7 @@ import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -179,7 +180,7 @@ def _check_tensors(path: object, expected: Mapping[str, tuple], found: Mapping[s
             raise CheckpointError(f"{path}: {name} has shape {list(found[name])}, its config says {list(shape)}")
 
 
-def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[str, object]:
+def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
         value = json.loads(metadata[key])
     except (KeyError, ValueError) as error:
@@ -189,7 +190,7 @@ def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[st
     return value
 
 
-def _config(path: object, settings: dict[str, object]) -> NetworkConfig:
+def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
     fields = {field.name: field for field in dataclasses.fields(NetworkConfig)}
     unknown = sorted(settings.keys() - fields.keys())
     if unknown:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 from warpgarment.attention import ACTIVATIONS
 
@@ -48,14 +49,14 @@ class NetworkConfig:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
 
     @classmethod
-    def base(cls, **changes: object) -> NetworkConfig:
+    def base(cls, **changes: Any) -> NetworkConfig:
         """The paper's network, 12.8 million parameters."""
         return cls(**changes)
 
     @classmethod
-    def small(cls, **changes: object) -> NetworkConfig:
+    def small(cls, **changes: Any) -> NetworkConfig:
         """A network for one CPU core, 0.5 million parameters."""
-        settings: dict[str, object] = {
+        settings: dict[str, Any] = {
             "embedding": 128,
             "layers": 4,
             "feed_forward": 192,

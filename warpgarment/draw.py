@@ -229,7 +229,8 @@ def film(
         for garment, color in zip(garments, itertools.cycle(colors), strict=False):
             worn = garment.vertices[min(t, garment.frames - 1)]
             surfaces.append(Surface(worn, garment.faces, color, lining=True))
-        there = replace(camera, target=tuple(map(float, middle[t] + np.asarray(camera.target))))
+        x, y, z = map(float, middle[t] + np.asarray(camera.target))
+        there = replace(camera, target=(x, y, z))
         return render(surfaces, there, size=size, floor=floor, samples=samples, device=device)
 
     wanted = list(range(motions[0].frames) if frames is None else frames)

@@ -92,7 +92,7 @@ def checked_faces(faces: Any, vertex_count: int, *, name: str = "faces", remedy:
         raise MeshError(f"{name} must have shape [F,3], got {list(array.shape)}. Split polygons into triangles first.")
     if array.dtype.kind not in "iu":
         raise MeshError(f"{name} must be integers, got {array.dtype}.")
-    bad = ((array < 0) | (array >= vertex_count)).any(axis=1)
+    bad = np.asarray(((array < 0) | (array >= vertex_count)).any(axis=1))
     complain(bad, name, f"name vertices that do not exist: indices must lie in 0..{vertex_count - 1:,}", remedy, "face")
     return np.ascontiguousarray(array, dtype=np.int32)
 

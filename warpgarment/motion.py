@@ -91,7 +91,8 @@ class GarmentMotion:
             if "status_finite" in data:
                 verdicts = [Verdict(str(v)) for v in data["status_verdict"]]
                 columns = [data[f"status_{key}"].tolist() for key in _STATUS]
-                status = [RolloutStatus(*row, verdict) for *row, verdict in zip(*columns, verdicts, strict=True)]
+                rows = zip(*columns, verdicts, strict=True)
+                status = [RolloutStatus(*row) for row in rows]
             name = str(data["name"]) if "name" in data else path.stem
             return cls(data["vertices"], data["faces"], float(data["fps"]), status, name)
         except (MeshError, KeyError, ValueError, TypeError) as error:

@@ -91,6 +91,17 @@ class ManifoldAwareTransformer(nn.Module):
         config: Its shape and settings; `NetworkConfig.base()` and `.small()` are the named ones.
     """
 
+    feature_mean: torch.Tensor
+    feature_std: torch.Tensor
+    velocity_mean: torch.Tensor
+    velocity_std: torch.Tensor
+    psi_mean: torch.Tensor
+    psi_std: torch.Tensor
+    singular_value_mean: torch.Tensor
+    singular_value_std: torch.Tensor
+    q_mean: torch.Tensor
+    q_std: torch.Tensor
+
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from warpgarment.batch import PackedBodies, PackedGarments, padded_views
@@ -26,6 +27,8 @@ from warpgarment.timing import Timings
 
 FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
 SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this
+CLOSEST = 0.004  # metres between a vertex and the body, at least
+CLEARANCE_PER_EDGE = 0.2  # ... and as a share of the mean edge length
 SHALLOW = 1e-3  # metres: collisions are repeated while a vertex is deeper
 WORTHWHILE = 0.9  # ... and while a pass leaves at most this share of the depth before it
 
@@ -40,7 +43,7 @@ class Scene:
         first_vertices: Garments in the first frame [m], packed, shape [V,3].
         network: Reads its config; run by `predict`.
         face_splits: As `padded_views`.
-        epsilon: Distance that collision refinement keeps from the body [m].
+        epsilon: Distance that collision refinement keeps from the body [m]; None: see `clearance`.
         collision_passes: At most so many refinements a frame.
         half: Whether the transformer runs in bfloat16.
         timings: Where the stages write how long they took.
@@ -58,17 +61,19 @@ class Scene:
         network: ManifoldAwareTransformer,
         *,
         face_splits: int,
-        epsilon: float,
+        epsilon: float | None,
         collision_passes: int,
         half: bool,
         timings: Timings,
     ) -> None:
         device = body_vertices.device
         self.garments, self.network, self.timings = list(garments), network, timings
-        self.epsilon, self.collision_passes, self.half = epsilon, collision_passes, half
+        self.collision_passes, self.half = collision_passes, half
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
 
+        margins = [clearance(garment) if epsilon is None else epsilon for garment in garments]
+        self.epsilon = torch.tensor(margins, device=device)[packed.garment_of_vertex.long()]
         self.body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
         self.body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
         self._bodies = BodyMeshes(body_vertices, bodies.faces, bodies.vertex_offsets, bodies.face_offsets)
@@ -228,6 +233,16 @@ class Scene:
         """Whether a flag holds for all elements of a garment; [N] and owner [N] -> [B]."""
         wrong = torch.zeros(self.packed.count, dtype=torch.int32, device=flags.device)
         return wrong.index_add(0, garment.long(), (~flags).int()) == 0
+
+
+def clearance(garment: Garment) -> float:
+    """Distance that vertices keep from the body [m]: 4 mm, or a fifth of the mean edge length if that is more.
+
+    Contact is per vertex, so between the vertices of a coarse garment a round body would show through.
+    """
+    i, j = garment.edges.T
+    edge = float(np.linalg.norm(garment.vertices[i] - garment.vertices[j], axis=1).mean())
+    return max(CLOSEST, CLEARANCE_PER_EDGE * edge)
 
 
 def _lengths(offsets: Sequence[int]) -> list[int]:

@@ -35,7 +35,8 @@ class Simulator:
     Args:
         network: Moved to the device, and used in evaluation mode whatever mode it is in.
         device: "cpu", "cuda", ...; None takes CUDA where there is any.
-        epsilon: Distance that collision refinement keeps between vertices and body [m].
+        epsilon: Distance that collision refinement keeps between vertices and body [m]. None: 4 mm, or a fifth of a
+            garment's mean edge length if that is more, since a body shows through between the vertices of coarse cloth.
         collision_passes: Collision refinement is repeated while a vertex is more than 1 mm deep and it helps, at most
             so often per frame; 0 leaves it out.
         half: Run the transformer in bfloat16: faster on recent GPUs. Geometry stays in float32.
@@ -50,17 +51,17 @@ class Simulator:
         network: ManifoldAwareTransformer,
         device: torch.device | str | None = None,
         *,
-        epsilon: float = 0.004,
+        epsilon: float | None = None,
         collision_passes: int = 4,
         half: bool = False,
     ) -> None:
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", torch.cuda.current_device())
-        if not epsilon >= 0.0 or collision_passes < 0:
+        if (epsilon is not None and not epsilon >= 0.0) or collision_passes < 0:
             raise ValueError(f"epsilon and collision_passes must not be negative, got {epsilon} and {collision_passes}")
         self.network = network.to(self.device)
-        self.epsilon, self.collision_passes, self.half = float(epsilon), int(collision_passes), half
+        self.epsilon, self.collision_passes, self.half = epsilon, int(collision_passes), half
         self.timings = Timings(self.device)
 
     @classmethod
@@ -154,12 +155,12 @@ class Simulator:
             if not state.finite.any():
                 break
         results = []
-        for i, garment in enumerate(garments):
+        for i, worn in enumerate(garments):
             if not statuses[i][-1].finite:
-                label = garment.name or f"garment {i}"
+                label = worn.name or f"garment {i}"
                 warnings.warn(f"{label} stopped: {statuses[i][-1].message}", RuntimeWarning, stacklevel=2)
             moved = positions[i][: len(statuses[i])]
-            results.append(GarmentMotion(moved, garment.faces, self.network.config.fps, statuses[i], garment.name))
+            results.append(GarmentMotion(moved, worn.faces, self.network.config.fps, statuses[i], worn.name))
         return results[0] if single else results
 
     def start(

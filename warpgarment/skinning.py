@@ -44,8 +44,9 @@ def linear_blend_skinning(
     complain(lost, "vertices", f"name bones beyond the {bones} of bone_transforms", "Repair bone_indices.", "vertex")
     uneven = ~(np.abs(weights.sum(axis=1) - 1.0) < 1e-3)
     complain(uneven, "vertices", "have bone weights that do not sum to 1", "Normalise bone_weights.", "vertex")
+    broken = np.asarray(~np.isfinite(transforms).all(axis=(1, 2, 3)))
     complain(
-        ~np.isfinite(transforms).all(axis=(1, 2, 3)), "frames", "have bone transforms that are NaN or infinite",
+        broken, "frames", "have bone transforms that are NaN or infinite",
         "Drop these frames or repair what wrote them.",
     )  # fmt: skip
     rows = np.repeat(np.arange(count), indices.shape[1])

@@ -34,7 +34,7 @@ def refine(
     index: np.ndarray,
     closest: np.ndarray,
     normals: np.ndarray,
-    epsilon: float,
+    epsilon: float | np.ndarray,
     lambda_lap: float = 0.5,
     lambda_reg: float = 1e-3,
 ) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 from .. import demo
 from ..report import STAGES, table
@@ -43,7 +44,8 @@ def run(options: Bench) -> None:
     for count in options.batch:
         simulator = Simulator.from_pretrained(options.weights, device=options.device, half=options.half)
         simulator.timings.synchronise = True
-        arguments = {"first_vertices": [dress.first_vertices] * count, "face_splits": options.face_splits}
+        first = [dress.first_vertices] * count
+        arguments: dict[str, Any] = {"first_vertices": first, "face_splits": options.face_splits}
         garments = [dress.garment] * count
         simulator.rollout(garments, assets.collider, frames=3, **arguments)
         simulator.timings.clear()

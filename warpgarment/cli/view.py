@@ -48,7 +48,7 @@ def run(options: View) -> None:
     if options.out is None:
         _window(body, garments)
         return
-    scene = [*([body] if body is not None else []), *garments]
+    scene: list[draw.Motion] = [*([body] if body is not None else []), *garments]
     if options.out.suffix.lower() == ".mp4":
         camera = draw.chase(scene, size=options.size, azimuth=options.azimuth)
         pictures = draw.film(body, garments, size=options.size, camera=camera)
@@ -68,11 +68,12 @@ def _window(body: BodyMotion | None, garments: list[GarmentMotion]) -> None:
     except ModuleNotFoundError as error:
         raise MissingExtra("window", "A window (without --out)") from error
     plotter = pyvista.Plotter(title="warpgarment")
-    shown = []
-    for motion, color in [
+    colored: list[tuple[draw.Motion, str]] = [
         *([(body, draw.SKIN)] if body is not None else []),
         *zip(garments, draw.PALETTE * 16, strict=False),
-    ]:
+    ]
+    shown: list[tuple[pyvista.PolyData, draw.Motion]] = []
+    for motion, color in colored:
         mesh = pyvista.PolyData.from_regular_faces(motion.vertices[0].copy(), motion.faces)
         plotter.add_mesh(mesh, color=color, smooth_shading=True)
         shown.append((mesh, motion))
@@ -81,9 +82,10 @@ def _window(body: BodyMotion | None, garments: list[GarmentMotion]) -> None:
     def advance(_: int) -> None:
         clock[0] += 1
         for mesh, motion in shown:
-            mesh.points[:] = motion.vertices[clock[0] % motion.frames]
+            position = motion.vertices[clock[0] % motion.frames]
+            mesh.points[:] = position  # type: ignore[index]  # PyVista's annotation leaves slices out
             mesh.compute_normals(inplace=True, split_vertices=False)
         plotter.render()
 
     plotter.add_timer_event(max_steps=10**9, duration=round(1000 / garments[0].fps), callback=advance)
-    plotter.show()
+    plotter.show()  # type: ignore[call-arg]  # PyVista's decorator hides that it is a method

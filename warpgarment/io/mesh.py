@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -150,7 +150,7 @@ def write_mesh(
     elif suffix == ".ply":
         import trimesh
 
-        data = trimesh.Trimesh(vertices, faces, process=False).export(file_type="ply")
+        data = cast(bytes, trimesh.Trimesh(vertices, faces, process=False).export(file_type="ply"))
         with atomic_file(path) as temporary:
             temporary.write_bytes(data)
     elif suffix in USD_SUFFIXES[:3]:

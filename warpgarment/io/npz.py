@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,5 +51,6 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     for key, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
             raise TypeError(f"{key} is an object array, which would need pickle")
+    named: dict[str, Any] = dict(arrays)  # Any: NumPy's stub would have each of them fit `allow_pickle` too
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **named)

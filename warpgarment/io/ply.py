@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,6 +23,7 @@ TYPES = {
 }
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 CORNERS = ("vertex_indices", "vertex_index")
+Column: TypeAlias = "np.ndarray | tuple[np.ndarray, np.ndarray]"  # numbers, or lists: their lengths, values end to end
 
 
 class _Element:
@@ -102,8 +105,9 @@ class _Binary:
     def read(self, element: _Element) -> dict:
         return self._uniform(element) or _collect(element, self.take)
 
-    def _uniform(self, element: _Element) -> dict | None:
-        start, fields = self.at, []
+    def _uniform(self, element: _Element) -> dict[str, Column] | None:
+        start = self.at
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         for name, kind, length in element.properties if element.count else ():
             if length is None:
                 fields.append((name, self.order + kind))
@@ -117,7 +121,7 @@ class _Binary:
         if not fields or start + dtype.itemsize * element.count > len(self.body):
             return None
         rows = np.frombuffer(self.body, dtype, element.count, start)
-        table = {}
+        table: dict[str, Column] = {}
         for name, _, length in element.properties:
             table[name] = rows[name]
             if length is not None:
@@ -148,13 +152,13 @@ class _Ascii:
         return _collect(element, self.take)
 
 
-def _collect(element: _Element, take) -> dict:
+def _collect(element: _Element, take: Callable[..., np.ndarray]) -> dict[str, Column]:
     """Row by row; lists become (lengths, values end to end)."""
-    rows = {name: [] for name, _, _ in element.properties}
+    rows: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in element.properties}
     for _ in range(element.count):
         for name, kind, length in element.properties:
             rows[name].append(take(kind, 1 if length is None else int(take(length)[0])))
-    table = {}
+    table: dict[str, Column] = {}
     for name, kind, length in element.properties:
         values = np.concatenate([np.zeros(0, dtype=kind), *rows[name]])
         sizes = np.array([len(row) for row in rows[name]], dtype=np.int64)

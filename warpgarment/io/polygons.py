@@ -22,7 +22,7 @@ def triangulate(vertices: np.ndarray, polygons: Sequence[Sequence[int]]) -> np.n
     faces: list[tuple[int, int, int]] = []
     for polygon in polygons:
         if len(polygon) == 3:
-            faces.append(tuple(polygon))
+            faces.append((polygon[0], polygon[1], polygon[2]))
         else:
             faces.extend(_one(np.asarray(vertices, dtype=np.float64)[list(polygon)], list(polygon)))
     return np.asarray(faces, dtype=np.int64).reshape(-1, 3)
@@ -49,7 +49,8 @@ def _one(corners: np.ndarray, polygon: list[int]) -> list[tuple[int, int, int]]:
             ear = int(np.argmax(_turns(flat[rest])))
         faces.append((polygon[rest[ear - 1]], polygon[rest[ear]], polygon[rest[(ear + 1) % len(rest)]]))
         del rest[ear]
-    return [*faces, tuple(polygon[k] for k in rest)]
+    a, b, c = rest
+    return [*faces, (polygon[a], polygon[b], polygon[c])]
 
 
 def _plane(corners: np.ndarray) -> np.ndarray:

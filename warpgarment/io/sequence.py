@@ -139,7 +139,7 @@ def write_sequence(
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        write_npz(path, {"vertices": vertices, "faces": faces, "fps": np.float64(fps), **(extra or {})})
+        write_npz(path, {"vertices": vertices, "faces": faces, "fps": np.array(fps, dtype=np.float64), **(extra or {})})
     elif suffix in USD_SUFFIXES[:3]:
         from .usd import write_usd
 
