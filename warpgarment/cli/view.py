@@ -87,5 +87,7 @@ def _window(body: BodyMotion | None, garments: list[GarmentMotion]) -> None:
             mesh.compute_normals(inplace=True, split_vertices=False)
         plotter.render()
 
-    plotter.add_timer_event(max_steps=10**9, duration=round(1000 / garments[0].fps), callback=advance)
-    plotter.show()  # type: ignore[call-arg]  # PyVista's decorator hides that it is a method
+    period = round(1000 / garments[0].fps)
+    # PyVista's decorator hides from type checkers that this is a method
+    plotter.add_timer_event(max_steps=10**9, duration=period, callback=advance)  # type: ignore[call-arg]
+    plotter.show()
