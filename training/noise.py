@@ -83,7 +83,6 @@ class NoiseBasis:
         self.white = 1.0 / 32.0
         self.component = np.asarray(vertex_component)
         self.components = int(self.component.max()) + 1
-        self.free_component = np.ones(self.components, np.float32)
         self.fade = np.ones((count, 1), np.float32)
         if len(pins):
             held = np.zeros(count)
@@ -92,7 +91,6 @@ class NoiseBasis:
             for _ in range(6):
                 near = np.maximum(averaging @ near, held)
             self.fade = (1.0 - near)[:, None].astype(np.float32)
-            self.free_component[np.unique(self.component[pins])] = 0.0
 
     def displacement(self, frames: int, config: NoiseConfig, rng: np.random.Generator) -> np.ndarray | None:
         """Displacements [frames, V, 3] in metres, oldest frame first; None for a clean sample."""
@@ -105,7 +103,7 @@ class NoiseBasis:
         steps[1:] *= config.walk
         steps = np.cumsum(steps, axis=0)[::-1]
         smooth = steps[:, :fields] * (self.scale[:, None] * (amplitude * config.position))
-        offset = steps[:, fields:] * (self.free_component[:, None] * (amplitude * config.offset))
+        offset = steps[:, fields:] * (amplitude * config.offset)
         delta = (self.fields @ smooth.transpose(1, 0, 2).reshape(fields, frames * 3)).reshape(count, frames, 3)
         white = rng.standard_normal((count, 3), dtype=np.float32) * (self.white * amplitude * config.position)
         delta += white[:, None] + offset.transpose(1, 0, 2)[self.component]

@@ -11,8 +11,12 @@ so the first frame is reproduced exactly, and what follows comes from the body a
 
 from __future__ import annotations
 
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
 import torch
 
+from warpgarment.kernels.laplacian import cotangent_laplacian
 from warpgarment.kernels.sdf import BodyMeshes
 
 
@@ -38,6 +42,46 @@ class BodyPins:
         triangles = body_vertices[self.corners]
         foot = (self.barycentric[..., None] * triangles).sum(dim=1)
         return foot + (_surface_frames(triangles) @ self.offset[..., None]).squeeze(-1)
+
+
+def mean_response(
+    rest_vertices: np.ndarray, faces: np.ndarray, pins: np.ndarray, face_component: np.ndarray, stiffness: float = 1e3
+) -> np.ndarray:
+    """How a garment that is held by its pins gives way when its mean is moved: the cheapest field with unit mean.
+
+    Pins fix the translation of the Poisson solve, and the predicted velocity q would be lost. Among all V the one that
+    minimises the same energy under the extra condition mean(V) = z + q is V_pinned + u (z + q - mean(V_pinned)), with
+
+        u = (L + W)^-1 c / (c^T (L + W)^-1 c),        c: share of each vertex in the mean face centroid
+
+    u is 0 at the pins and grows away from them. It is constant per garment.
+
+    Args:
+        rest_vertices: Rest positions [m], shape [V,3].
+        faces: Shape [F,3].
+        pins: Pinned vertices, shape [P]; may be empty.
+        face_component: Connected component of each face, shape [F].
+        stiffness: Of a pin, in units of the mean diagonal entry of the Laplacian.
+
+    Returns:
+        u, float32 [V]; zero on components without pins.
+    """
+    response = np.zeros(len(rest_vertices), np.float32)
+    if not len(pins):
+        return response
+    laplacian = cotangent_laplacian(rest_vertices, faces)
+    diagonal = laplacian.diagonal()
+    weight = np.zeros(len(rest_vertices))
+    weight[pins] = stiffness * diagonal[diagonal > 0].mean()
+    pinned = np.unique(face_component[np.isin(faces, pins).any(1)])
+    for component in pinned:
+        mine = faces[face_component == component]
+        share = np.bincount(mine.ravel(), minlength=len(rest_vertices)) / mine.size
+        vertices = np.unique(mine)
+        held = (laplacian + scipy.sparse.diags(weight))[vertices][:, vertices].tocsc()
+        moved = scipy.sparse.linalg.spsolve(held, share[vertices])
+        response[vertices] = moved / (share[vertices] @ moved)
+    return response
 
 
 def barycentric_coordinates(points: torch.Tensor, triangles: torch.Tensor) -> torch.Tensor:

@@ -22,13 +22,14 @@ from warpgarment.kernels.poisson import PoissonSolver
 from warpgarment.kernels.sdf import BodyMeshes
 from warpgarment.network import ManifoldAwareTransformer, NetworkOutput
 from warpgarment.parametrisation import Step, compose, context
-from warpgarment.pins import BodyPins
+from warpgarment.pins import BodyPins, mean_response
 from warpgarment.timing import Timings
 
 FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
 SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this
 CLOSEST = 0.004  # metres between a vertex and the body, at least
 CLEARANCE_PER_EDGE = 0.2  # ... and as a share of the mean edge length
+PINNED_MEAN = 0.9  # share of the way that q moves a pinned garment from where its pins alone would hold it
 SHALLOW = 1e-3  # metres: collisions are repeated while a vertex is deeper
 WORTHWHILE = 0.9  # ... and while a pass leaves at most this share of the depth before it
 
@@ -88,6 +89,8 @@ class Scene:
         if pinned:
             body_of_pin = bodies.body_of_garment[packed.garment_of_pin.long()]
             self.pins = BodyPins(first_vertices[packed.pins.long()], self._bodies, body_of_pin)
+            responses = [mean_response(g.vertices, g.faces, g.pins, g.components[1]) for g in garments]
+            self.mean_response = torch.from_numpy(np.concatenate(responses)).to(device)[:, None]
 
     def bodies(self, body_vertices: torch.Tensor) -> BodyMeshes:
         """The bodies' meshes with these vertices; moves them there if the last caller had them elsewhere."""
@@ -175,12 +178,17 @@ class Scene:
             target = replace_singular_values((psi @ phi).contiguous(), stretch)
         with self.timings("poisson"):
             velocity = torch.nan_to_num(step.velocity, 0.0, 0.0, 0.0)
+            mean = self.components_mean(vertices) + velocity
             solved = self.poisson.solve(
                 target,
-                self.components_mean(vertices) + velocity,
+                mean,
                 initial=vertices + velocity[packed.vertex_component.long()],
                 pin_targets=None if self.pins is None else self.pins.targets(next_body),
             )
+            if self.pins is not None:
+                missing = mean - self.components_mean(solved)
+                missing = PINNED_MEAN * missing[packed.vertex_component.long()]
+                solved = solved + self.mean_response * missing
         return self.keep_finite(solved, vertices, finite)
 
     def push_out(
