@@ -137,7 +137,7 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
         raise NoTestData(f"{config.data}: no {config.split} sequence to evaluate ({reasons or 'none found'})")
     result = {
-        "settings": {k: str(v) if isinstance(v, Path) else v for k, v in vars(config).items()},
+        "settings": {k: v.name if isinstance(v, Path) else v for k, v in vars(config).items()},  # results travel
         "network": _describe(path, simulator),
         "frames_predicted": predicted_frames,
         "seconds_per_frame": spent / max(predicted_frames, 1),
