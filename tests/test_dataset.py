@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -107,8 +108,9 @@ def test_the_gate_rejects_bad_frames_and_says_why(frame, damage, message):
     """If this fails, stretched, exploded or penetrating cloth becomes ground truth."""
     gate, vertices, body = _gate()
     assert gate.check(0, vertices, body) is None
-    with pytest.raises(AssertionError, match=message):
-        raise AssertionError(gate.check(frame, damage(vertices), body))
+    reason = gate.check(frame, damage(vertices), body)
+    assert reason is not None
+    assert re.search(message, reason), reason
 
 
 def test_figures_of_a_good_sequence_are_plain_numbers():

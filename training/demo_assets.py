@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.garment import Garment
-from warpgarment.skinning import linear_blend_skinning
 
 from .bodies import anny_bodies
 from .garments import Pattern, make_garment
 from .procedural import procedural
 from .quality import QualityGate
-from .skeleton import arms_abducted, blended_in, bone_transforms, facing_forward
+from .skeleton import arms_abducted, blended_in, facing_forward, posed
 from .teacher import simulate
 
 FPS, BLEND, FRAMES, SEED = 30.0, 20, 130, 2026
@@ -42,11 +41,7 @@ def make(out: Path, device: str = "cpu") -> None:
     body = anny_bodies().rest(**PHENOTYPE)
     poses = arms_abducted(body, procedural(body, "walk", FRAMES, seed=SEED, fps=FPS), 15.0)
     poses = blended_in(body, facing_forward(poses), BLEND)
-    transforms = bone_transforms(body, poses)
-    frames = linear_blend_skinning(body.vertices, body.bone_indices, body.bone_weights, transforms)
-    lift = np.quantile(frames[:, :, 1].min(1), 0.05)
-    transforms[:, :, 1, 3] -= lift
-    frames[:, :, 1] -= lift
+    frames, transforms = posed(body, poses)
     collider = body.collider_faces()
     body.save(out / "rest_body.npz")
     np.savez_compressed(

@@ -20,14 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.garment import Garment
-from warpgarment.skinning import linear_blend_skinning
 
 from .dataset import MANIFEST, write_sequence
 from .garments import CATEGORIES, Pattern, make_garment, sampled_pattern
 from .motions import read_bvh, retarget
 from .procedural import KINDS, procedural
 from .quality import Limits, QualityGate
-from .skeleton import PoseSequence, arms_abducted, blended_in, bone_transforms, facing_forward, mirrored
+from .skeleton import PoseSequence, arms_abducted, blended_in, facing_forward, mirrored, posed
 from .teacher import ClothSettings, simulate
 
 FPS = 30.0
@@ -170,11 +169,7 @@ def make_sequence(config: GenerateConfig, number: int) -> dict:
     folder = config.out / f"{number:05d}_{plan.category}"
     began = time.perf_counter()
     body, poses = body_motion(plan, config)
-    transforms = bone_transforms(body, poses)
-    frames = linear_blend_skinning(body.vertices, body.bone_indices, body.bone_weights, transforms)
-    lift = np.quantile(frames[:, :, 1].min(1), 0.05)  # feet on the floor in most frames
-    transforms[:, :, 1, 3] -= lift
-    frames[:, :, 1] -= lift
+    frames, transforms = posed(body, poses)
     collider = body.collider_faces()
     manifest = {
         "format": 1,

@@ -1,4 +1,4 @@
-"""Motions made by formula: walking and running on the spot of a path, turning, jumping, bending, waving the arms.
+"""Motions made by formula: walking, running, turning, jumping, bending, lifting the arms.
 
 They need no files, so the demo and anyone without motion capture can use them. Joint angles are low-order Fourier
 curves of the gait phase in the manner of normal gait data (hip about +-25 degrees, knee up to 60 in swing); they are

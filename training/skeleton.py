@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from warpgarment.skinning import linear_blend_skinning
+
 from .bodies import RestBody
 
 
@@ -46,6 +48,20 @@ def bone_transforms(body: RestBody, poses: PoseSequence) -> np.ndarray:
             heads[:, bone] = heads[:, parent] + rotations[:, parent] @ (body.joints[bone] - body.joints[parent])
     translation = heads - np.einsum("tbij,bj->tbi", rotations, body.joints)
     return np.concatenate([rotations, translation[..., None]], axis=3).astype(np.float32)
+
+
+def posed(body: RestBody, poses: PoseSequence) -> tuple[np.ndarray, np.ndarray]:
+    """The body in every frame, its feet on the floor in most of them.
+
+    Returns:
+        Vertices [m], float32 [T, U, 3], and the bone transforms that give them, float32 [T, B, 3, 4].
+    """
+    transforms = bone_transforms(body, poses)
+    frames = linear_blend_skinning(body.vertices, body.bone_indices, body.bone_weights, transforms)
+    lift = np.quantile(frames[:, :, 1].min(1), 0.05)
+    transforms[:, :, 1, 3] -= lift
+    frames[:, :, 1] -= lift
+    return frames, transforms
 
 
 def heading(rotations: np.ndarray) -> np.ndarray:
