@@ -30,6 +30,12 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         MeshError: Not an OBJ file, cut short, or a face names a vertex that does not exist; with the line.
     """
+    vertices, polygons = read_polygons(path)
+    return vertices.astype(np.float32), triangulate(vertices, polygons)
+
+
+def read_polygons(path: Path) -> tuple[np.ndarray, list[list[int]]]:
+    """Vertices, float64 [V,3], and corners of each polygon of an OBJ file; otherwise as `read_obj`."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
     for number, line in _lines(path):
@@ -57,7 +63,7 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: {len(beyond):,} of {len(polygons):,} faces name vertices beyond the {len(vertices):,} of the "
             f"file (first: vertex {max(beyond[0]) + 1}). The file is damaged or cut short."
         )
-    return positions.astype(np.float32), triangulate(positions, polygons)
+    return positions, polygons
 
 
 def _lines(path: Path):

@@ -14,8 +14,9 @@ from ..skinning import linear_blend_skinning
 from .atomic import atomic_files, atomic_folder
 from .mesh import READABLE, read_mesh, scale_of
 from .npz import read_npz, write_npz
-from .obj import obj_text, read_obj
+from .obj import obj_text, read_polygons
 from .pc2 import read_pc2, write_pc2_to
+from .polygons import triangulate
 from .usd import SUFFIXES as USD_SUFFIXES
 
 SKINNED = ("rest_vertices", "faces", "bone_indices", "bone_weights", "bone_transforms")
@@ -104,17 +105,17 @@ def _read_folder(path: Path) -> SequenceData:
     )
     if not files:
         raise MeshError(f"{path}: no .obj files in this folder.")
-    first, faces = read_obj(files[0])
+    first, polygons = read_polygons(files[0])
     frames = [first]
     for file in files[1:]:
-        vertices, same = read_obj(file)
-        if vertices.shape != first.shape or same.shape != faces.shape or (same != faces).any():
+        vertices, same = read_polygons(file)
+        if vertices.shape != first.shape or same != polygons:
             raise MeshError(
                 f"{file}: {len(vertices):,} vertices and {len(same):,} faces, unlike {files[0].name} with "
-                f"{len(first):,} and {len(faces):,}, or in another order. All frames must share one topology."
+                f"{len(first):,} and {len(polygons):,}, or in another order. All frames must share one topology."
             )
         frames.append(vertices)
-    return SequenceData(np.stack(frames), faces)
+    return SequenceData(np.stack(frames).astype(np.float32), triangulate(first, polygons))
 
 
 def write_sequence(

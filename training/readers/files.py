@@ -1,0 +1,175 @@
+"""Garment animations and a body animation in PC2, OBJ sequences, USD or NPZ, put together.
+
+recording("dress.pc2", "body.pc2", fps=30)                        # with dress.obj and body.obj beside them
+recording(["shirt/", "jacket/"], "body.npz", unit="cm")           # folders of .obj, innermost first
+recording([("scene.usd", "shirt")], ("scene.usd", "body"))        # meshes of a stage by name
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from warpgarment.body import BodyMotion
+from warpgarment.errors import MeshError
+from warpgarment.io.mesh import read_mesh
+from warpgarment.io.sequence import SequenceData, read_sequence
+
+from ..materials import Material
+from .recording import RecordedGarment, Recording, recorded_garment
+
+Source = str | os.PathLike | tuple[str | os.PathLike, str]
+FPS = 30.0  # where no file says
+SMALLEST, LARGEST = 0.03, 3.0  # a garment's height over the body's, beyond which their units differ
+FARTHEST = 3.0  # body heights between their centres, beyond which they do not belong together
+
+
+def recording(
+    garment: Source | Sequence[Source],
+    body: Source | BodyMotion | None = None,
+    *,
+    rest: str | os.PathLike | Sequence[str | os.PathLike] | None = None,
+    fps: float | None = None,
+    unit: str | None = None,
+    body_unit: str | None = None,
+    clean: bool = False,
+    materials: Sequence[Material | None] = (),
+    wind: np.ndarray | None = None,
+) -> Recording:
+    """Puts animations of garments and of the body under them together.
+
+    Args:
+        garment: A file or folder as `BodyMotion.load` reads them, or several, innermost first; (file, mesh) names one
+            mesh of a USD stage.
+        body: The same for the body; a `BodyMotion`; None: no body.
+        rest: Rest shapes, one mesh file a garment, with the same vertices in the same order. By default the mesh beside
+            a .pc2, else the first frame.
+        fps: Frames per second; overrides the files', which must agree otherwise. 30 where none says.
+        unit: Length unit of the files: "m", "dm", "cm", "mm", "in"; see `Garment.load`.
+        body_unit: That of the body, where it is another.
+        clean: Repair rest meshes that a garment cannot have; the frames follow.
+        materials: One a garment, where known.
+        wind: Velocity of the air [m/s], [T, 3].
+
+    Raises:
+        MeshError: Frames, rates, vertices or sizes that do not fit each other, or a damaged file.
+        FileNotFoundError: There is no such file.
+
+    Warns:
+        UserWarning: A garment has no rest shape of its own.
+    """
+    several = isinstance(garment, (list, tuple)) and not _is_one(garment)
+    sources = cast(list[Source], list(cast(Sequence, garment)) if several else [garment])
+    rests = [rest] if rest is None or isinstance(rest, (str, os.PathLike)) else list(rest)
+    if rest is not None and len(rests) != len(sources):
+        raise MeshError(f"{len(rests)} rest shapes for {len(sources)} garments. Give one each.")
+    rates: dict[str, float] = {}
+    garments = [
+        _garment(source, still, unit, clean, rates)
+        for source, still in zip(sources, rests if rest is not None else [None] * len(sources), strict=True)
+    ]
+    motion = _body(body, body_unit or unit, rates)
+    rate = _rate(fps, rates)
+    if motion is not None and motion.fps != rate:
+        motion = BodyMotion(motion.vertices, motion.faces, rate)
+    names = ", ".join(str(_split(source)[0]) for source in sources)
+    made = Recording(tuple(garments), motion, rate, tuple(materials), wind, source=names)
+    if motion is not None:
+        for one in made.garments:
+            _check_place(one, motion, names)
+    return made
+
+
+def _is_one(source: Sequence) -> bool:
+    """Whether a tuple is (file, mesh): a stage and a name, rather than two files."""
+    return (
+        isinstance(source, tuple)
+        and len(source) == 2
+        and isinstance(source[1], str)
+        and Path(source[0]).suffix.lower().startswith(".usd")
+        and not Path(source[1]).exists()
+    )
+
+
+def _split(source: Source) -> tuple[Path, str | None]:
+    return (Path(source[0]), source[1]) if isinstance(source, tuple) else (Path(source), None)
+
+
+def _read(source: Source, unit: str | None, rates: dict[str, float]) -> tuple[Path, str, SequenceData]:
+    path, mesh = _split(source)
+    data = read_sequence(path, unit=unit, mesh=mesh)
+    name = mesh.rsplit("/", 1)[-1] if mesh else path.stem
+    if data.fps is not None:
+        rates[f"{path.name}{f' ({mesh})' if mesh else ''}"] = float(data.fps)
+    return path, name, data
+
+
+def _garment(
+    source: Source, rest: str | os.PathLike | None, unit: str | None, clean: bool, rates: dict[str, float]
+) -> RecordedGarment:
+    path, name, data = _read(source, unit, rates)
+    frames, faces = np.asarray(data.vertices), np.asarray(data.faces)
+    if rest is None and path.suffix.lower() == ".pc2":
+        rest = next(p for p in (path.with_suffix(".obj"), path.with_suffix(".ply")) if p.exists())
+    if rest is None:
+        warnings.warn(
+            f"{path}: no rest shape: the first frame serves, and how the cloth is stretched there counts as none. "
+            "Give one with rest=.",
+            UserWarning,
+            stacklevel=3,
+        )
+        return recorded_garment(name, frames[0], faces, frames, where=str(path), clean=clean)
+    still = read_mesh(Path(rest), unit=unit)
+    if len(still.vertices) != frames.shape[1]:
+        raise MeshError(f"{rest} has {len(still.vertices):,} vertices, {path} {frames.shape[1]:,}.")
+    others = np.asarray(still.faces)
+    same = others.shape == faces.shape and (np.sort(others, axis=1) == np.sort(faces, axis=1)).all(axis=1).mean() > 0.5
+    if not same:  # a few may differ: bent quads are split one way or the other
+        raise MeshError(f"{rest} and {path} have other faces: they must share one topology and order.")
+    return recorded_garment(name, np.asarray(still.vertices), others, frames, where=str(path), clean=clean)
+
+
+def _body(body: Source | BodyMotion | None, unit: str | None, rates: dict[str, float]) -> BodyMotion | None:
+    if body is None:
+        return None
+    if isinstance(body, BodyMotion):
+        rates["body"] = body.fps
+        return body
+    path, _, data = _read(body, unit, rates)
+    try:
+        motion = BodyMotion(data.vertices, data.faces, data.fps or FPS)
+        return motion if data.collider_faces is None else motion.submesh(data.collider_faces)
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from None
+
+
+def _rate(fps: float | None, rates: dict[str, float]) -> float:
+    if fps is not None:
+        return float(fps)
+    if len({round(rate, 6) for rate in rates.values()}) > 1:
+        listed = ", ".join(f"{name} {rate:g}" for name, rate in rates.items())
+        raise MeshError(f"frames per second differ: {listed}. Resample, or say which is right with fps=.")
+    return next(iter(rates.values()), FPS)
+
+
+def _check_place(garment: RecordedGarment, body: BodyMotion, names: str) -> None:
+    """Raises MeshError unless both are, in the first frame, of such sizes and in such places as go together."""
+    firsts = (garment.vertices[0].astype(np.float64), body.vertices[0].astype(np.float64))
+    size, height = (float(np.ptp(first, axis=0).max()) for first in firsts)
+    if not SMALLEST <= size / height <= LARGEST:
+        raise MeshError(
+            f"{names}: the garment {garment.rest.name!r} is {size:.3g} m and the body {height:.3g} m in size: one of "
+            "them is in another unit. Say which with unit= and body_unit=."
+        )
+    centres = [0.5 * (first.min(axis=0) + first.max(axis=0)) for first in firsts]
+    apart = float(np.linalg.norm(centres[0] - centres[1]))
+    if apart > FARTHEST * height:
+        raise MeshError(
+            f"{names}: the garment {garment.rest.name!r} starts {apart:.3g} m from the body: they are in other places, "
+            "or one has another axis up."
+        )

@@ -1,0 +1,132 @@
+"""Bodies that a data set describes by SMPL parameters.
+
+The SMPL model has a licence of its own and does not come with this package, so the body's surface is made by the user:
+readers take `body=` as a `BodyMotion`, or as a function that gets these poses and returns vertices and faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warpgarment.body import BodyMotion
+from warpgarment.errors import MeshError
+from warpgarment.io.npz import write_npz
+
+from .axes import y_up, z_up
+
+BODY_JOINTS = 22  # those that SMPL and SMPL-H share; SMPL adds two hands, SMPL-H thirty finger joints
+AMASS_JOINTS = 52
+
+
+@dataclass(frozen=True, eq=False)
+class SmplPoses:
+    """SMPL parameters of a sequence, in the data set's axes.
+
+    A vertex v of the shaped body with the pelvis at J goes to R (v - J) + trans where `centred`, and to
+    R (v - J) + J + trans, SMPL's own convention, where not; R is the first rotation, the other joints posed before.
+
+    Attributes:
+        rotations: Axis-angle of each joint relative to its parent [rad], the whole body's first, shape [T, 24, 3].
+        trans: Translation [m], shape [T, 3].
+        betas: Shape coefficients, [S], or [T, S] where they change.
+        gender: "female", "male" or "neutral".
+        fps: Frames per second.
+        up: "y" or "z".
+        centred: The pelvis is at `trans` (True), or at `trans` and its rest position (False).
+        source: The file, for messages.
+    """
+
+    rotations: np.ndarray
+    trans: np.ndarray
+    betas: np.ndarray
+    gender: str = "neutral"
+    fps: float = 30.0
+    up: str = "z"
+    centred: bool = False
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        frames, where = len(self.rotations), f"{self.source}: " if self.source else ""
+        if self.rotations.ndim != 3 or self.rotations.shape[2] != 3 or self.trans.shape != (frames, 3):
+            raise MeshError(
+                f"{where}SMPL poses need rotations [T,J,3] and translations [T,3], got "
+                f"{list(self.rotations.shape)} and {list(self.trans.shape)}."
+            )
+        for name, array in (("rotations", self.rotations), ("translations", self.trans)):
+            bad = ~np.isfinite(array.reshape(frames, -1)).all(axis=1)
+            if bad.any():
+                raise MeshError(
+                    f"{where}{bad.sum():,} of {frames:,} frames have SMPL {name} that are NaN or infinite "
+                    f"(first: frame {int(np.argmax(bad))}). Leave this sample out."
+                )
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    def turned(self, turn: Rotation) -> SmplPoses:
+        """The same motion of a centred body, turned about the origin."""
+        rotations = self.rotations.copy()
+        rotations[:, 0] = (turn * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
+        return replace(self, rotations=rotations, trans=turn.apply(self.trans))
+
+    def save_amass(self, path: str | Path) -> None:
+        """Writes the motion as an AMASS .npz (Z up), which `training.motions.read_amass` reads.
+
+        The 22 joints that SMPL and SMPL-H share; fingers straight. Where the pelvis rests is not known without the
+        model, so translations may be off by a constant.
+        """
+        rotations, trans = self.rotations.astype(np.float64), self.trans.astype(np.float64)
+        if self.up == "y":
+            turn = Rotation.from_rotvec([np.pi / 2, 0, 0])
+            trans, rotations = z_up(trans), rotations.copy()
+            rotations[:, 0] = (turn * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
+        poses = np.zeros((len(self), 3 * AMASS_JOINTS))
+        count = 3 * min(BODY_JOINTS, rotations.shape[1])
+        poses[:, :count] = rotations.reshape(len(self), -1)[:, :count]
+        betas = np.asarray(self.betas, dtype=np.float64)
+        arrays = {
+            "poses": poses,
+            "trans": trans,
+            "betas": betas if betas.ndim == 1 else betas[0],
+            "gender": np.array(self.gender),
+            "mocap_framerate": np.array(float(self.fps)),
+        }
+        write_npz(Path(path), arrays)
+
+
+BodySource = BodyMotion | str | Path | Callable[[SmplPoses], tuple[np.ndarray, np.ndarray]] | None
+
+
+def body_from(body: BodySource, poses: SmplPoses | None) -> BodyMotion | None:
+    """The body that a reader was given, or that the given function makes of the poses.
+
+    Args:
+        body: A motion (metres, Y up, in the recording's place) or its file; a function from poses to vertices
+            [T, U, 3] in the axes of the poses and faces [F, 3]; or None.
+        poses: What the function gets; None: the files hold none.
+
+    Raises:
+        MeshError: There are no poses for the function, or it returned something that is not a body, or another
+            number of frames.
+    """
+    if body is None or isinstance(body, BodyMotion):
+        return body
+    if isinstance(body, (str, Path)):
+        return BodyMotion.load(body)
+    if poses is None:
+        raise MeshError("No SMPL poses in the files to make a body of. Give a BodyMotion as body=.")
+    vertices, faces = body(poses)
+    vertices = np.asarray(vertices)
+    if vertices.ndim != 3 or len(vertices) != len(poses):
+        raise MeshError(
+            f"body(poses) returned vertices of shape {list(vertices.shape)} for {len(poses):,} frames. "
+            "It must return vertices [T,U,3] and faces [F,3]."
+        )
+    if poses.up == "z":
+        vertices = y_up(vertices)
+    return BodyMotion(vertices, faces, poses.fps)
