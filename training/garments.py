@@ -1,42 +1,83 @@
-"""Parametric garments, cut from the body's surface in its rest pose and offset from it.
+"""Parametric garments, cut from a surface around the body in its rest pose.
 
-A garment is the part of the template where a signed field is positive (below the neckline, above the hem, up to a
-point along the sleeve), moved outwards, smoothed, remeshed isotropically and kept clear of the body. Skirts continue
-from the lower boundary loop as a flared tube.
+A garment is the part of that surface (`garment_shell`) where a signed field is positive (`garment_regions`): below the
+neckline, above the hem, up to a point along the sleeve. Skirts and hems continue from the lower boundary as tubes
+(`garment_tubes`), jackets are opened in front, and the whole is remeshed isotropically and kept clear of the body.
 """
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from warpgarment.garment import Garment
 
 from .bodies import RestBody
-from .mesh_cutting import boundary_loops, cut_below_zero, pushed_out, remeshed
+from .garment_checks import faults
+from .garment_regions import (
+    JACKETS,
+    PINNED_NECKLINES,
+    WITH_BODICE,
+    WITH_TUBE,
+    bottom,
+    covered,
+    ease_field,
+    keep_field,
+    waist,
+)
+from .garment_shell import shell
+from .garment_tubes import with_tube
+from .mesh_cutting import (
+    cut_below_zero,
+    largest_piece,
+    pushed_out,
+    remeshed,
+    smoothed_boundary,
+    split_at_zero,
+    without_specks,
+)
 
-CATEGORIES = ("tshirt", "top", "trousers", "skirt", "dress", "jumpsuit")
-_SIZE = {"tshirt": 1.0, "top": 0.8, "trousers": 1.0, "skirt": 1.2, "dress": 1.5, "jumpsuit": 1.5}  # by area
-_FAR = 9.0
-_WAISTBAND = 0.03
+CATEGORIES = ("tshirt", "top", "trousers", "skirt", "dress", "jumpsuit", "jacket", "hooded_jacket")
+NECKLINES = ("round", "v", "wide", *PINNED_NECKLINES)
+_NECKLINES = {
+    "tshirt": ("round", "v", "wide"),
+    "top": NECKLINES,
+    "dress": NECKLINES,
+    "jumpsuit": ("round", "v", "straps"),
+    "jacket": ("round", "v"),
+}
+# faces relative to a T-shirt, by area
+_SIZE = {"tshirt": 1.0, "top": 0.8, "trousers": 1.0, "skirt": 1.0, "dress": 1.4, "jumpsuit": 1.5, "jacket": 1.3}
+_BAND = 0.03  # height of what is pinned [m]
+_FLOOR = 0.06  # skirts end at least this much above the floor [m]
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """What is sampled of a garment. Lengths in metres, shares in 0..1.
+    """What is sampled of a garment. Lengths in metres, shares without unit.
 
     Attributes:
         category: One of :data:`CATEGORIES`.
-        sleeve: Share of the upper arm that sleeves cover.
-        hem: How far a shirt reaches below the hips' widest part.
+        sleeve: Where sleeves end: 0 at the shoulder, 1 at the elbow, 2 at the wrist. See :func:`needs_forearms`. There
+            are none with straps or strapless.
+        hem: How far a shirt or jacket reaches below the hips, 2 cm above their joints; negative: it ends above them.
         leg: Share of the leg that trousers cover.
-        skirt_length: Length of a skirt below the waist seam.
-        flare: Growth of a skirt's radius over its length.
+        skirt_length: Length of a skirt below the waist seam; one that would reach the floor ends above it.
+        flare: Growth of a skirt's radius over its length, beyond what the body below it takes; of the hem of shirts and
+            jackets, per metre.
         ease: Distance from the body it is cut with.
-        neck: How far the neckline is lowered.
+        neck: How far the neckline is lowered in front; of straps and strapless garments, the upper edge.
         faces: Number of faces aimed at.
+        neckline: One of :data:`NECKLINES`; jackets have the first three only. Straps, and the upper edge of strapless
+            garments, are pins.
+        neck_width: How far the neckline is widened on each side; straps move outwards by half of it.
+        strap: Width of each strap.
+        sleeve_flare: Growth of the sleeves' distance from the arm, from shoulder to elbow.
+        leg_flare: Growth of the trouser legs' distance from the leg, from hip to ankle.
+        waist: How far waistline or waistband lie above their usual place.
+        opening: Width of a jacket's opening in front.
+        hood: Distance between head and hood, beyond the ease. The hood's crown is pinned.
     """
 
     category: str
@@ -48,28 +89,69 @@ class Pattern:
     ease: float = 0.014
     neck: float = 0.0
     faces: int = 1200
+    neckline: str = "round"
+    neck_width: float = 0.01
+    strap: float = 0.05
+    sleeve_flare: float = 0.0
+    leg_flare: float = 0.0
+    waist: float = 0.0
+    opening: float = 0.03
+    hood: float = 0.02
 
     def as_dict(self) -> dict[str, float | int | str]:
         """Plain values for a manifest."""
         return asdict(self)
 
 
-def sampled_pattern(category: str, rng: np.random.Generator, faces: int) -> Pattern:
-    """A pattern with its measures drawn at random."""
+def sampled_pattern(category: str, rng: np.random.Generator, faces: int, long_sleeves: bool = False) -> Pattern:
+    """A pattern with its measures drawn at random.
+
+    Args:
+        category: One of :data:`CATEGORIES`.
+        rng: Where randomness comes from.
+        faces: Faces of a T-shirt; other categories scale with their area.
+        long_sleeves: Whether sleeves may reach the wrists, and those of jackets do. The body's forearms must then be
+            part of the collider, or the sleeves bunch at the elbows (:func:`needs_forearms`). By default they end
+            above the elbows.
+    """
     if category not in CATEGORIES:
         raise ValueError(f"unknown garment category {category!r}; there are {', '.join(CATEGORIES)}")
-    loose = category in ("trousers", "jumpsuit")
-    return Pattern(
+    like = "jacket" if category in JACKETS else category
+    eases = {"trousers": (0.016, 0.034), "jumpsuit": (0.018, 0.034), "jacket": (0.030, 0.045)}
+    short = category == "top" or (category in ("dress", "jumpsuit") and rng.random() < 0.4)
+    if like == "jacket":
+        sleeves = (1.4, 1.85) if long_sleeves else (0.65, 0.88)
+    else:
+        sleeves = (0.0, 0.15) if short else (0.3, 1.85 if long_sleeves else 0.88)
+    hems = {"top": (-0.12, 0.12), "jacket": (-0.05, 0.20)}
+    offered = _NECKLINES.get(like, ("round",))
+    pattern = Pattern(
         category=category,
-        sleeve=0.12 if category == "top" else float(rng.uniform(0.35, 0.85)),
-        hem=float(rng.uniform(0.04, 0.14)),
-        leg=float(rng.uniform(0.45, 0.92)),
-        skirt_length=float(rng.uniform(0.35, 0.65)),
-        flare=float(rng.uniform(0.08, 0.22)),
-        ease=float(rng.uniform(0.028, 0.040) if loose else rng.uniform(0.012, 0.020)),
-        neck=float(rng.uniform(0.0, 0.02)),
-        faces=round(faces * _SIZE[category] * rng.uniform(0.85, 1.15)),
+        sleeve=float(rng.uniform(*sleeves)),
+        hem=float(rng.uniform(*hems.get(like, (0.0, 0.16)))),
+        leg=float(rng.uniform(0.3, 0.95)),
+        skirt_length=float(rng.uniform(0.3, 0.95)),
+        flare=float(rng.uniform(0.02, 0.35)),
+        ease=float(rng.uniform(*eases.get(like, (0.012, 0.024)))),
+        neck=float(rng.uniform(0.0, 0.06)),
+        neckline=offered[int(rng.integers(len(offered)))],
+        neck_width=float(rng.uniform(0.0, 0.03)),
+        strap=float(rng.uniform(0.04, 0.07)),
+        sleeve_flare=float(rng.uniform(0.0, 0.02)),
+        leg_flare=float(rng.uniform(0.0, 0.05)),
+        waist=float(rng.uniform(-0.02, 0.03)),
+        opening=float(rng.uniform(0.02, 0.06)),
+        hood=float(rng.uniform(0.015, 0.035)),
     )
+    length = {"trousers": 0.4 + 0.7 * pattern.leg, "skirt": 0.5 + 1.4 * pattern.skirt_length}
+    length |= {"jumpsuit": 0.6 + 0.4 * pattern.leg, "dress": 0.6 + 0.8 * pattern.skirt_length}
+    size = _SIZE[like] * length.get(category, 1.0) * (1.2 if category == "hooded_jacket" else 1.0)
+    return replace(pattern, faces=round(faces * size * rng.uniform(0.85, 1.15)))
+
+
+def needs_forearms(pattern: Pattern) -> bool:
+    """Whether a garment has sleeves over the forearms, so that cloth must collide with them."""
+    return pattern.category in WITH_BODICE and pattern.sleeve > 1.0 and pattern.neckline not in PINNED_NECKLINES
 
 
 def make_garment(body: RestBody, pattern: Pattern, gap: float = 0.011) -> tuple[Garment, float]:
@@ -81,96 +163,59 @@ def make_garment(body: RestBody, pattern: Pattern, gap: float = 0.011) -> tuple[
         gap: Least distance from the body at the start [m].
 
     Returns:
-        The garment, its waistband pinned where the category needs it, and the edge length aimed at [m].
+        The garment, pinned where it would fall off otherwise, and the edge length aimed at [m].
+
+    Raises:
+        ValueError: Unknown category or neckline, or a pattern that cannot be cut cleanly for this body; it says why.
     """
-    vertices, faces = cut_below_zero(body.vertices, body.faces.astype(np.int64), _field(body, pattern))
-    normals = _vertex_normals(vertices, faces)
-    vertices = pushed_out(
-        vertices + normals * pattern.ease, faces, body.vertices, body.faces, 0.5 * pattern.ease, rounds=4, smoothing=10
-    )
-    if pattern.category in ("skirt", "dress"):
-        vertices, faces = _with_tube(vertices, faces, pattern.skirt_length, pattern.flare, bulge=0.06, rings=24)
-    elif pattern.category in ("tshirt", "top"):
-        vertices, faces = _with_tube(vertices, faces, pattern.hem, 0.2 * pattern.flare, bulge=0.01, rings=6)
+    for what, known in (("category", CATEGORIES), ("neckline", NECKLINES)):
+        if getattr(pattern, what) not in known:
+            raise ValueError(f"unknown garment {what} {getattr(pattern, what)!r}; there are {', '.join(known)}")
+    if pattern.category in JACKETS and pattern.neckline in PINNED_NECKLINES:
+        raise ValueError(f"a {pattern.category} has no {pattern.neckline!r} neckline")
+    vertices, faces = _surface(body, pattern)
     vertices, faces, edge = remeshed(vertices, faces, pattern.faces)
-    vertices = pushed_out(vertices, faces, body.vertices, body.faces, gap, rounds=8, smoothing=3)
+    vertices = pushed_out(vertices, faces, body.vertices, body.faces, gap)
     name = pattern.category
-    return Garment(vertices.astype(np.float32), faces.astype(np.int32), pins=_pins(vertices, name), name=name), edge
+    garment = Garment(vertices.astype(np.float32), faces.astype(np.int32), pins=_pins(vertices, pattern), name=name)
+    if found := faults(garment, body, pattern, gap):
+        raise ValueError(f"{name} does not suit this body: {'; '.join(found)}. Draw another pattern.")
+    return garment, edge
 
 
-def _field(body: RestBody, pattern: Pattern) -> np.ndarray:
-    """Positive where the garment is [m], shape [U]."""
-    category, (x, y, z) = pattern.category, body.vertices.T
-    left, right = body.weight_of("LeftArm") > 0.25, body.weight_of("RightArm") > 0.25
-    on_arm = left | right
-    waist = body.joint("LowerBack")[1] + 0.06
-    hip = body.joint("LeftUpLeg")[1]
-    leg_length = hip - body.joint("LeftFoot")[1]
-    keep = np.full(len(x), _FAR)
-    if category in ("tshirt", "top", "jumpsuit", "dress"):
-        neck = body.joint("Neck")
-        keep = np.minimum(keep, neck[1] + 0.045 - pattern.neck - y - 0.5 * (z - neck[2]))
-        for mask, side in ((left, "Left"), (right, "Right")):
-            shoulder, elbow = body.joint(f"{side}Arm"), body.joint(f"{side}ForeArm")
-            length = np.linalg.norm(elbow - shoulder)
-            along = (body.vertices - shoulder) @ ((elbow - shoulder) / length)
-            keep = np.where(mask, np.minimum(keep, pattern.sleeve * length - along), keep)
-    if category in ("tshirt", "top"):
-        keep = np.minimum(keep, np.where(on_arm, _FAR, y - (hip + 0.02)))
-    if category == "dress":
-        keep = np.minimum(keep, np.where(on_arm, _FAR, y - waist))
-    if category in ("trousers", "jumpsuit"):
-        keep = np.minimum(keep, np.where(on_arm, _FAR, y - (hip - pattern.leg * leg_length)))
-    if category in ("trousers", "skirt"):
-        keep = np.minimum(keep, np.where(on_arm, -_FAR, waist - y))
-    if category == "skirt":
-        keep = np.minimum(keep, y - (waist - 0.10))
-    return keep
+def _surface(body: RestBody, pattern: Pattern) -> tuple[np.ndarray, np.ndarray]:
+    """The garment as a fine triangle mesh of no particular quality."""
+    arms = body.weight_of("LeftArm", "RightArm")
+    around = shell(body, ease_field(body, pattern), covered(body, pattern))
+    keep = without_specks(around.faces, keep_field(body, pattern, around), least=12)
+    vertices, faces = cut_below_zero(around.vertices, around.faces, keep)
+    vertices = smoothed_boundary(vertices, faces, rounds=6)
+    length = max(pattern.hem, 0.0)
+    if pattern.category in ("skirt", "dress"):
+        length = pattern.skirt_length - (waist(body, pattern) - bottom(body, pattern))
+        length = min(length, vertices[:, 1].min() - _FLOOR)
+    if pattern.category in WITH_TUBE and length > 0.01:
+        flare = pattern.flare if pattern.category in ("skirt", "dress") else pattern.flare * length
+        points = body.vertices[arms < 0.1]
+        vertices, faces = with_tube(vertices, faces, points, length=length, flare=flare, ease=pattern.ease)
+    if pattern.category in JACKETS:
+        vertices, faces = _opened(vertices, faces, body, pattern)
+    return vertices, faces
 
 
-def _with_tube(vertices: np.ndarray, faces: np.ndarray, length: float, flare: float, bulge: float, rings: int):
-    """Extrudes the lowest boundary loop downwards as a tube that widens by `flare` [m] and, at once, by `bulge` [m]."""
-    loop = min(boundary_loops(faces), key=lambda l: vertices[l, 1].mean())
-    base = vertices[loop]
-    centre = base.mean(0)
-    radial = (base - centre) * np.array([1.0, 0.0, 1.0])
-    radius = np.linalg.norm(radial, axis=1, keepdims=True)
-    direction = radial / radius
-    points, rows = [vertices], [loop]
-    top = base[:, 1:2]
-    for ring in range(1, rings + 1):
-        t = ring / rings
-        ringed = centre + direction * (radius + flare * t + bulge * np.sin(0.5 * np.pi * min(2.2 * t, 1.0)))
-        ringed[:, 1:2] = top - length * t
-        rows.append(len(vertices) + (ring - 1) * len(loop) + np.arange(len(loop)))
-        points.append(ringed)
-    following = np.roll(np.arange(len(loop)), -1)
-    strips = [faces]
-    for a, b in itertools.pairwise(rows):
-        strips.append(np.stack([a[following], a, b], 1))
-        strips.append(np.stack([a[following], b, b[following]], 1))
-    joined = np.concatenate(strips)
-    points = np.concatenate(points)
-    return points, _consistently_oriented(points, joined, len(faces))
+def _opened(vertices: np.ndarray, faces: np.ndarray, body: RestBody, pattern: Pattern) -> tuple[np.ndarray, np.ndarray]:
+    """Takes a strip out of the front, from hem to neck. The strip may be narrower than the faces."""
+    half = 0.5 * pattern.opening
+    for edge in (-half, half):
+        vertices, faces, _ = split_at_zero(vertices, faces, vertices[:, 0] - edge)
+    centres = vertices[faces].mean(1)
+    in_front = (centres[:, 2] > body.joint("Neck")[2] + 0.01) & (centres[:, 1] < body.joint("Head")[1])
+    return largest_piece(vertices, faces[~(in_front & (np.abs(centres[:, 0]) < half))])
 
 
-def _consistently_oriented(vertices: np.ndarray, faces: np.ndarray, first_new: int) -> np.ndarray:
-    """Flips the new faces where they disagree with the old ones along the seam."""
-    old = {tuple(e) for f in faces[:first_new] for e in ((f[0], f[1]), (f[1], f[2]), (f[2], f[0]))}
-    clash = any(tuple(e) in old for f in faces[first_new:] for e in ((f[0], f[1]), (f[1], f[2]), (f[2], f[0])))
-    if clash:
-        faces = np.concatenate([faces[:first_new], faces[first_new:, ::-1]])
-    return faces
-
-
-def _pins(vertices: np.ndarray, category: str) -> np.ndarray | None:
-    """The waistband of garments that nothing else holds up."""
-    if category not in ("trousers", "skirt"):
+def _pins(vertices: np.ndarray, pattern: Pattern) -> np.ndarray | None:
+    """The upper end of what nothing else holds up: waistband, straps, strapless edge, the crown of a hood."""
+    strapped = pattern.category in WITH_BODICE and pattern.neckline in PINNED_NECKLINES
+    if not strapped and pattern.category not in ("trousers", "skirt", "hooded_jacket"):
         return None
-    return np.flatnonzero(vertices[:, 1] > vertices[:, 1].max() - _WAISTBAND).astype(np.int32)
-
-
-def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    import igl
-
-    return np.asarray(igl.per_vertex_normals(vertices, faces.astype(np.int64)))
+    return np.flatnonzero(vertices[:, 1] > vertices[:, 1].max() - _BAND).astype(np.int32)
