@@ -1,18 +1,25 @@
-"""The bundled rest body, and a BVH writer for the tests of motions."""
+"""The bundled rest body, and writers of BVH and AMASS files for the tests of motions."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
 
-from warpgarment import demo
-from warpgarment.training.bodies import RestBody
+import numpy as np
+
+from warpgarment.training.bodies import RestBody, bundled_body
+
+SMPL_JOINTS = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
+)  # fmt: skip
 
 
 @lru_cache(maxsize=1)
 def rest_body() -> RestBody:
     """The body that ships with the demo, in its rest pose."""
-    return RestBody.load(Path(demo.ASSETS) / "rest_body.npz")
+    return bundled_body()
 
 
 def write_bvh(path: Path, joints: list[tuple[str, str | None, tuple[float, float, float]]], frames, fps=30.0) -> Path:
@@ -45,4 +52,23 @@ def write_bvh(path: Path, joints: list[tuple[str, str | None, tuple[float, float
     lines += ["MOTION", f"Frames: {len(frames)}", f"Frame Time: {1.0 / fps:.7f}"]
     lines += [" ".join(f"{v:.6f}" for v in frame) for frame in frames]
     path.write_text("\n".join(lines))
+    return path
+
+
+def write_amass(path: Path, turns: dict[str, np.ndarray], frames: int, rate: float | None = 120.0, **more) -> Path:
+    """Writes an AMASS motion in SMPL-H's order.
+
+    Args:
+        path: The file.
+        turns: Axis-angles [radians] of the joints that turn, by SMPL's names, shape [T, 3] or [3].
+        frames: Number of frames T.
+        rate: Frames per second; None leaves it out.
+        more: Other arrays; they replace those made here, None leaves one out.
+    """
+    poses = np.zeros((frames, 52, 3))
+    for name, turn in turns.items():
+        poses[:, SMPL_JOINTS.index(name)] = turn
+    arrays = {"poses": poses.reshape(frames, -1), "trans": np.zeros((frames, 3)), "betas": np.zeros(16)}
+    arrays |= {"gender": np.array("neutral"), "mocap_framerate": None if rate is None else np.array(rate)} | more
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
     return path

@@ -37,7 +37,7 @@ class RestBody:
         bone_parents: Parent of each bone, -1 for the root; parents come first.
         bone_indices: The bones that move each vertex, shape [U, K].
         bone_weights: Their weights, each row sums to 1, shape [U, K].
-        phenotype: The values it was made from.
+        phenotype: Anny's values it was made from; empty for bodies that are not Anny's.
     """
 
     vertices: np.ndarray
@@ -60,13 +60,14 @@ class RestBody:
             bone_parents=np.array(self.bone_parents, dtype=np.int32),
             bone_indices=self.bone_indices,
             bone_weights=self.bone_weights,
-            phenotype=np.array([self.phenotype[name] for name in PHENOTYPES]),
+            phenotype=np.array([self.phenotype.get(name, np.nan) for name in PHENOTYPES]),
         )
 
     @classmethod
     def load(cls, path: str | Path) -> RestBody:
         """Reads what :meth:`save` wrote."""
         with np.load(path, allow_pickle=False) as data:
+            phenotype = zip(PHENOTYPES, data["phenotype"].tolist(), strict=True)
             return cls(
                 vertices=data["vertices"].astype(np.float64),
                 faces=data["faces"],
@@ -75,7 +76,7 @@ class RestBody:
                 bone_parents=tuple(int(p) for p in data["bone_parents"]),
                 bone_indices=data["bone_indices"],
                 bone_weights=data["bone_weights"],
-                phenotype=dict(zip(PHENOTYPES, data["phenotype"].tolist(), strict=True)),
+                phenotype={name: value for name, value in phenotype if np.isfinite(value)},
             )
 
     def bone(self, name: str) -> int:
@@ -106,6 +107,27 @@ class RestBody:
         return (forearm < 0.5)[self.faces].all(1)
 
 
+@lru_cache(maxsize=1)
+def bundled_body() -> RestBody:
+    """The body that ships with the package: no download, no extra."""
+    from warpgarment.demo import ASSETS
+
+    return RestBody.load(ASSETS / "rest_body.npz")
+
+
+def sampled_phenotype(rng: np.random.Generator) -> dict[str, float]:
+    """Anny's values of a random person, 1.4 to 2.1 m tall: women and men, teenagers (0.5) to the old (1), any build."""
+    woman = rng.random() < 0.5
+    return {
+        "gender": float(rng.uniform(0.85, 1.0) if woman else rng.uniform(0.0, 0.15)),
+        "age": float(rng.uniform(0.5, 1.0)),
+        "muscle": float(rng.uniform(0.15, 0.85)),
+        "weight": float(rng.uniform(0.1, 0.9)),
+        "height": float(np.clip(rng.normal(0.5, 0.1), 0.3, 0.7)),
+        "proportions": float(rng.uniform(0.2, 0.8)),
+    }
+
+
 class AnnyBodies:
     """Anny's shape space evaluated on the light template. Make one with :func:`anny_bodies`."""
 
@@ -124,7 +146,7 @@ class AnnyBodies:
         data = self._data
         loops = np.split(data["hole_loops"], np.cumsum(data["hole_lengths"])[:-1])
         full = _with_hole_centres(full, loops)
-        vertices = _smoothed(np.einsum("vk,vkc->vc", data["barycentric"], full[data["corners"]]), data["faces"])
+        vertices = smoothed(np.einsum("vk,vkc->vc", data["barycentric"], full[data["corners"]]), data["faces"])
         lift = -np.array([0.0, vertices[:, 1].min(), 0.0])  # feet on the floor
         return RestBody(
             vertices=vertices + lift,
@@ -257,7 +279,7 @@ def _barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return weights / weights.sum(1, keepdims=True)
 
 
-def _smoothed(vertices: np.ndarray, faces: np.ndarray, rounds: int = 12) -> np.ndarray:
+def smoothed(vertices: np.ndarray, faces: np.ndarray, rounds: int = 12) -> np.ndarray:
     """Taubin's smoothing (lambda 0.5, mu -0.53): takes off details that would poke through the faces of a garment."""
     mean = averaging(faces, len(vertices))
     for _ in range(rounds):

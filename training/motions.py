@@ -1,4 +1,4 @@
-"""Motion clips: the BVH reader, and retargeting to a body by world-space rotations.
+"""Motions from files: clips read by suffix, and put on a body by world-space rotations.
 
 Retargeting copies each source bone's rotation from its zero pose, in the world, after turning the zero pose of the
 limbs onto the target's rest pose. Root translation is scaled by the ratio of leg lengths, so file units do not matter.
@@ -7,7 +7,6 @@ limbs onto the target's rest pose. Root translation is scaled by the ratio of le
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
 
+from .amass import amass_length, read_amass
 from .bodies import RestBody
+from .bvh import bvh_length, read_bvh
+from .clips import Clip, resampled, resampled_length
 from .skeleton import PoseSequence
+
+__all__ = ["Clip", "clip_frames", "jumps", "list_clips", "read_amass", "read_bvh", "read_clip", "resampled", "retarget"]
 
 # What the DAZ-friendly CMU release calls the bones of the MotionBuilder-friendly one; None takes the parent's rotation.
 _DAZ = {
@@ -31,126 +35,44 @@ _LIMBS = {
     "LeftUpLeg": "LeftLeg", "LeftLeg": "LeftFoot", "RightUpLeg": "RightLeg", "RightLeg": "RightFoot",
     "LeftArm": "LeftForeArm", "LeftForeArm": "LeftHand", "RightArm": "RightForeArm", "RightForeArm": "RightHand",
 }  # fmt: skip
-_Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_READERS = {".bvh": (read_bvh, bvh_length), ".npz": (read_amass, amass_length)}
+_FASTEST_ROOT = 12.0  # [m/s]; a sprinter's
+_FASTEST_BONE = 1800.0  # [degrees/s]; twice a runner's shin
 
 
-@dataclass(frozen=True)
-class Clip:
-    """A motion on its own skeleton, Y up, in the file's units.
-
-    Attributes:
-        names: Joint names, root first.
-        offsets: Offset of each joint from its parent in the zero pose, shape [J, 3].
-        rotations: World rotation of each joint, shape [T, J, 3, 3].
-        root: Position of the root, shape [T, 3].
-        fps: Frames per second.
-    """
-
-    names: tuple[str, ...]
-    offsets: np.ndarray
-    rotations: np.ndarray
-    root: np.ndarray
-    fps: float
+def list_clips(folder: str | Path) -> list[Path]:
+    """The clips in a folder (.bvh and .npz files, not those in folders below), sorted by name; none is opened."""
+    return sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in _READERS and p.is_file())
 
 
-def read_bvh(path: str | Path) -> Clip:
-    """Reads a BVH file; a Z-up file (the mean head is above the hips along Z) is turned Y up.
+def read_clip(path: str | Path) -> Clip:
+    """Reads a clip by its suffix: .bvh or AMASS .npz.
 
     Raises:
-        MeshError: The file is not BVH, or its numbers do not match its hierarchy.
+        MeshError: Another suffix, or a file that is damaged.
     """
+    return _reader(path)[0](path)
+
+
+def clip_frames(path: str | Path, fps: float = 30.0) -> int:
+    """Frames that a clip has after :func:`retarget` to a frame rate; only the file's header is read.
+
+    Raises:
+        MeshError: Another suffix, or no header.
+    """
+    frames, rate = _reader(path)[1](path)
+    return resampled_length(frames, rate, fps)
+
+
+def _reader(path: str | Path):
     path = Path(path)
-    tokens = path.read_text(errors="replace").split()
-    if not tokens or tokens[0] != "HIERARCHY" or "MOTION" not in tokens:
-        raise MeshError(f"{path.name} is not a BVH file: it has no HIERARCHY and MOTION sections.")
-    motion = tokens.index("MOTION")
-    names, parents, offsets, channels = _hierarchy(tokens[1:motion])
-    try:
-        frames, frame_time = int(tokens[motion + 2]), float(tokens[motion + 5])
-        values = np.array(tokens[motion + 6 :], dtype=np.float64)
-    except (ValueError, IndexError) as error:
-        raise MeshError(f"{path.name}: the MOTION section holds something that is not a number.") from error
-    width = sum(map(len, channels))
-    if len(values) != frames * width or frames == 0 or frame_time <= 0:
-        raise MeshError(f"{path.name}: {frames:,} frames of {width} channels announced, {len(values):,} numbers found.")
-    rotations, positions = _forward(parents, offsets, channels, values.reshape(frames, width))
-    head = next((i for i, n in enumerate(names) if n.lower() == "head"), len(names) - 1)
-    up = int(np.abs((positions[:, head] - positions[:, 0]).mean(0)).argmax())
-    turn = _Z_UP_TO_Y_UP if up == 2 else np.eye(3)
-    return Clip(
-        names=tuple(names),
-        offsets=offsets @ turn.T,
-        rotations=turn @ rotations @ turn.T,
-        root=positions[:, 0] @ turn.T,
-        fps=1.0 / frame_time,
-    )
-
-
-def _hierarchy(tokens: list[str]):
-    names: list[str] = []
-    parents: list[int] = []
-    offsets: list[list[float]] = []
-    channels: list[list[str]] = []
-    stack: list[int] = []
-    current, i = -1, 0
-    while i < len(tokens):
-        word = tokens[i]
-        if word in ("ROOT", "JOINT"):
-            names.append(tokens[i + 1])
-            parents.append(stack[-1] if stack else -1)
-            offsets.append([0.0, 0.0, 0.0])
-            channels.append([])
-            current = len(names) - 1
-            i += 2
-        elif word == "End":
-            current = -2  # an end site has an offset but is no joint
-            i += 2
-        elif word == "{":
-            stack.append(current)
-            i += 1
-        elif word == "}":
-            stack.pop()
-            i += 1
-        elif word == "OFFSET":
-            if stack[-1] >= 0:
-                offsets[stack[-1]] = [float(v) for v in tokens[i + 1 : i + 4]]
-            i += 4
-        elif word == "CHANNELS":
-            count = int(tokens[i + 1])
-            channels[stack[-1]] = tokens[i + 2 : i + 2 + count]
-            i += 2 + count
-        else:
-            i += 1
-    return names, parents, np.array(offsets), channels
-
-
-def _forward(parents, offsets, channels, values):
-    """World rotations [T, J, 3, 3] and positions [T, J, 3] by forward kinematics."""
-    frames, joints = len(values), len(parents)
-    rotations, positions = np.empty((frames, joints, 3, 3)), np.empty((frames, joints, 3))
-    column = 0
-    for j, parent in enumerate(parents):
-        own = values[:, column : column + len(channels[j])]
-        column += len(channels[j])
-        local = np.tile(offsets[j], (frames, 1))
-        axes, angles = "", []
-        for channel, value in zip(channels[j], own.T, strict=True):
-            if channel.endswith("position"):
-                local[:, "XYZ".index(channel[0])] = value
-            else:
-                axes += channel[0]
-                angles.append(value)
-        turn = Rotation.from_euler(axes, np.stack(angles, 1), degrees=True).as_matrix() if axes else np.eye(3)[None]
-        if parent < 0:
-            rotations[:, j], positions[:, j] = turn, local
-        else:
-            rotations[:, j] = rotations[:, parent] @ turn
-            positions[:, j] = positions[:, parent] + np.einsum("tij,tj->ti", rotations[:, parent], local)
-    return rotations, positions
+    if path.suffix.lower() not in _READERS:
+        raise MeshError(f"{path.name}: motions are read from .bvh and AMASS .npz files, not from {path.suffix!r}.")
+    return _READERS[path.suffix.lower()]
 
 
 def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
-    """The clip on another body, resampled to `fps` by nearest frames.
+    """The clip on another body, resampled to `fps`.
 
     Raises:
         MeshError: The clip's joints are named neither as CMU MotionBuilder nor as DAZ names them.
@@ -163,9 +85,8 @@ def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
             f"{len(missing)} bones have no joint in the clip (first: {missing[0]}); its joints are "
             f"{', '.join(clip.names[:6])}, ... Names of the CMU MotionBuilder or DAZ releases are understood."
         )
-    frames = np.round(np.arange(0, len(clip.root) - 1e-6, clip.fps / fps)).astype(int)
-    frames = frames[frames < len(clip.root)]
-    rotations = np.empty((len(frames), len(body.bone_names), 3, 3))
+    clip = resampled(clip, fps)
+    rotations = np.empty((len(clip), len(body.bone_names), 3, 3))
     alignment = {a: _limb_alignment(clip, body, source, a, b) for a, b in _LIMBS.items()}
     alignment |= {"LeftHand": alignment["LeftForeArm"], "RightHand": alignment["RightForeArm"]}
     for bone, name in enumerate(body.bone_names):
@@ -173,8 +94,24 @@ def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
         if joint is None:
             rotations[:, bone] = rotations[:, body.bone_parents[bone]]
         else:
-            rotations[:, bone] = clip.rotations[frames, clip.names.index(joint)] @ alignment.get(name, np.eye(3))
-    return PoseSequence(rotations, clip.root[frames] * _leg_ratio(clip, body, source), fps)
+            rotations[:, bone] = clip.rotations[:, clip.names.index(joint)] @ alignment.get(name, np.eye(3))
+    return PoseSequence(rotations, clip.root * _leg_ratio(clip, body, source), fps)
+
+
+def jumps(body: RestBody, poses: PoseSequence) -> np.ndarray:
+    """Frames to which the body cannot have moved from the frame before, bool [T]: markers were lost or swapped.
+
+    The root is faster than 12 m/s, or a bone of the trunk, head, thighs, shins or arms than 1,800 degrees a second.
+    Hands, feet and toes, whose few markers often flicker, move little cloth and may.
+    """
+    carried = {b for name in ("Hand", "Foot") for side in ("Left", "Right") for b in body.chain(side + name)}
+    bones = [b for b in range(len(body.bone_names)) if b not in carried]
+    relative = poses.rotations[:-1, bones].transpose(0, 1, 3, 2) @ poses.rotations[1:, bones]
+    cosine = 0.5 * (np.trace(relative, axis1=2, axis2=3).min(axis=1, initial=3.0) - 1.0)
+    turned = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    moved = np.linalg.norm(np.diff(poses.root, axis=0), axis=1)
+    too_fast = (turned > _FASTEST_BONE / poses.fps) | (moved > _FASTEST_ROOT / poses.fps)
+    return np.concatenate([[False], too_fast])
 
 
 def _limb_alignment(clip: Clip, body: RestBody, source, bone: str, child: str) -> np.ndarray:

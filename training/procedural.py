@@ -1,17 +1,18 @@
 """Motions made by formula: walking, running, turning, jumping, bending, lifting the arms.
 
 They need no files, so the demo and anyone without motion capture can use them. Joint angles are low-order Fourier
-curves of the gait phase in the manner of normal gait data (hip about +-25 degrees, knee up to 60 in swing); they are
-meant to move cloth plausibly, not to pass for motion capture.
+curves of the gait phase in the manner of normal gait data (hip about +-25 degrees, knee up to 60 in swing), the root's
+height follows from the lower foot; they are meant to move cloth plausibly, not to pass for motion capture.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from .bodies import RestBody
-from .skeleton import PoseSequence, about_y
+from .skeleton import PoseSequence, about_y, bone_transforms
 
 KINDS = ("walk", "run", "turn", "jump", "bend", "arms")
 
@@ -50,7 +51,7 @@ def _walk(time, ease, rng) -> dict[str, np.ndarray]:
         curves[f"{side}Arm"] = np.radians(22) * stride * ease * np.cos(p)
         curves[f"{side}ForeArm"] = -np.radians(18) * ease * (1.2 - np.cos(p))
     curves["speed"] = ease * 1.25 * stride * cadence / 0.9
-    curves["bob"] = -0.018 * ease * (1 - np.cos(2 * phase))
+    curves["flight"] = np.zeros_like(time)
     curves["sway"] = 0.02 * ease * np.sin(phase)
     curves["twist"] = np.radians(7) * ease * np.cos(phase)
     curves["roll"] = np.radians(3) * ease * np.sin(phase)
@@ -70,7 +71,7 @@ def _run(time, ease, rng) -> dict[str, np.ndarray]:
         curves[f"{side}Arm"] = ease * np.radians(30) * np.cos(p)
         curves[f"{side}ForeArm"] = -ease * np.radians(75)
     curves |= {
-        "speed": ease * rng.uniform(2.2, 3.0), "bob": 0.035 * ease * np.cos(2 * phase + 0.6),
+        "speed": ease * rng.uniform(2.2, 3.0), "flight": 0.04 * ease * (0.5 + 0.5 * np.cos(2 * phase)) ** 2,
         "sway": 0.012 * ease * np.sin(phase), "twist": np.radians(10) * ease * np.cos(phase),
         "roll": np.radians(3) * ease * np.sin(phase), "lean": np.radians(9) * ease,
     }  # fmt: skip
@@ -79,7 +80,7 @@ def _run(time, ease, rng) -> dict[str, np.ndarray]:
 
 def _still(time) -> dict[str, np.ndarray]:
     names = [s + b for s in ("Left", "Right") for b in ("UpLeg", "Leg", "Foot", "Arm", "ForeArm")]
-    return {name: np.zeros_like(time) for name in (*names, "speed", "bob", "sway", "twist", "roll", "lean")}
+    return {name: np.zeros_like(time) for name in (*names, "speed", "flight", "sway", "twist", "roll", "lean")}
 
 
 def _jump(time, ease, rng) -> dict[str, np.ndarray]:
@@ -87,7 +88,6 @@ def _jump(time, ease, rng) -> dict[str, np.ndarray]:
     period, height = rng.uniform(1.3, 1.8), rng.uniform(0.15, 0.3)
     t = np.maximum(time - 0.5, 0) % period / period
     air = np.clip((t - 0.45) / 0.3, 0, 1)
-    flight = 4 * height * air * (1 - air)
     crouch = np.where(t < 0.45, np.sin(np.pi * t / 0.45), 0) + np.where(t > 0.75, np.sin(np.pi * (t - 0.75) / 0.25), 0)
     crouch *= ease * rng.uniform(0.6, 0.9)
     for side in ("Left", "Right"):
@@ -95,7 +95,7 @@ def _jump(time, ease, rng) -> dict[str, np.ndarray]:
         curves[f"{side}Leg"] = crouch * np.radians(95)
         curves[f"{side}Foot"] = -crouch * np.radians(40)
         curves[f"{side}Arm"] = crouch * np.radians(35)
-    curves["bob"] = flight * ease - 0.22 * crouch
+    curves["flight"] = ease * 4 * height * air * (1 - air)
     curves["lean"] = crouch * np.radians(25)
     return curves
 
@@ -152,5 +152,17 @@ def _assemble(body: RestBody, curves: dict[str, np.ndarray], fps: float) -> Pose
         rotations[:, bone] = facing @ own if parent < 0 else rotations[:, parent] @ own
     forward, left = facing[:, :, 2], facing[:, :, 0]
     root = np.cumsum(forward * curves["speed"][:, None], axis=0) / fps + left * curves["sway"][:, None]
-    root[:, 1] = body.joints[0, 1] + curves["bob"]
+    height = _standing(body, rotations, fps) + curves["flight"]
+    root[:, 1] = gaussian_filter1d(height, 0.05 * fps, mode="nearest")  # feet change, land and leave without a jolt
     return PoseSequence(rotations, root, fps)
+
+
+def _standing(body: RestBody, rotations: np.ndarray, fps: float) -> np.ndarray:
+    """Height of the root at which the lower foot stands on the floor [m], shape [T]."""
+    transforms = bone_transforms(body, PoseSequence(rotations, np.zeros((len(rotations), 3)), fps))[:, :, 1]
+    feet = []
+    for side in ("Left", "Right"):
+        sole = body.vertices[body.weight_of(f"{side}Foot") > 0.5]
+        foot = transforms[:, body.bone(f"{side}Foot")].astype(np.float64)
+        feet.append((foot[:, :3] @ sole.T).min(1) + foot[:, 3])
+    return -np.min(feet, axis=0)

@@ -64,6 +64,16 @@ def posed(body: RestBody, poses: PoseSequence) -> tuple[np.ndarray, np.ndarray]:
     return frames, transforms
 
 
+def longest_run(bad: np.ndarray) -> slice:
+    """The longest run of frames that are not bad, of bool [T]; empty where there is none."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], bad, [True]]).astype(int)))
+    starts, ends = edges[::2], edges[1::2]
+    if not len(starts):
+        return slice(0, 0)
+    k = int((ends - starts).argmax())
+    return slice(int(starts[k]), int(ends[k]))
+
+
 def heading(rotations: np.ndarray) -> np.ndarray:
     """Rotation about +Y nearest to each rotation [..., 3, 3], as an angle [rad]."""
     return np.arctan2(rotations[..., 0, 2] - rotations[..., 2, 0], rotations[..., 0, 0] + rotations[..., 2, 2])
@@ -131,9 +141,9 @@ def mirrored(body: RestBody, poses: PoseSequence) -> PoseSequence:
     def twin(name: str) -> int:
         for a, b in (("Left", "Right"), ("LHip", "RHip"), ("LThumb", "RThumb")):
             if name.startswith(a):
-                return names.index(b + name[len(a):])
+                return names.index(b + name[len(a) :])
             if name.startswith(b):
-                return names.index(a + name[len(b):])
+                return names.index(a + name[len(b) :])
         return names.index(name)
 
     flip = np.diag([-1.0, 1.0, 1.0])
