@@ -14,14 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgarment.garment import Garment
-
 from .bodies import anny_bodies
 from .garments import Pattern, make_garment
 from .procedural import procedural
 from .quality import QualityGate
 from .skeleton import arms_abducted, blended_in, facing_forward, posed
-from .teacher import simulate
+from .teachers import Cloth, ClothScene
+from .teachers.newton_vbd import NewtonTeacher
 
 FPS, BLEND, FRAMES, SEED = 30.0, 20, 130, 2026
 PHENOTYPE = {"gender": 0.9, "age": 0.68, "muscle": 0.5, "weight": 0.45, "height": 0.5, "proportions": 0.7}
@@ -58,10 +57,10 @@ def make(out: Path, device: str = "cpu") -> None:
     for name, pattern in PATTERNS.items():
         garment, edge = make_garment(body, pattern)
         placed = (garment.vertices @ first[:, :3].T + first[:, 3]).astype(np.float32)
-        gate = QualityGate(garment, body.faces[collider])
+        gate = QualityGate((garment,), body.faces[collider])
         truth = []
-        start = Garment(placed, garment.faces, pins=garment.pins, name=name)
-        for frame, vertices in enumerate(simulate(start, edge, frames, body.faces[collider], fps=FPS, device=device)):
+        scene = ClothScene((Cloth(garment, edge, placed),), frames, body.faces[collider], fps=FPS)
+        for frame, vertices in enumerate(NewtonTeacher(device=device).simulate(scene)):
             reason = gate.check(frame, vertices, frames[frame])
             if reason:
                 raise RuntimeError(f"{name}: {reason}")

@@ -1,0 +1,126 @@
+"""Physics teachers behind one interface: a cloth scene in, garment frames out.
+
+    teacher = make_teacher("newton", device="cpu")
+    for vertices in teacher.simulate(scene):   # float32 [V,3], the scene's cloths end to end
+        ...
+
+`newton` (Newton's VBD, extra `physics`) runs in this process; `blender` runs Blender's cloth through `bpy` in a virtual
+environment of its own, as a subprocess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from warpgarment.garment import Garment
+
+from ..materials import Material
+
+TEACHERS = ("newton", "blender")
+
+
+@dataclass(frozen=True)
+class Cloth:
+    """One garment of a scene.
+
+    Attributes:
+        garment: Rest mesh [m]; its pins are tied to the body's surface, or held in place where there is no body.
+        start: Where its vertices are when the simulation begins [m], float32 [V, 3], clear of the body's first frame
+            and of the other cloths. None: the rest mesh as it is.
+        edge: Typical edge length [m].
+        material: What it is made of.
+    """
+
+    garment: Garment
+    edge: float
+    start: np.ndarray | None = None
+    material: Material = field(default_factory=Material)
+
+    @property
+    def first(self) -> np.ndarray:
+        """The vertices at the start, float32 [V, 3]."""
+        return self.garment.vertices if self.start is None else self.start
+
+
+@dataclass(frozen=True)
+class ClothScene:
+    """Garments on a moving body, in the wind.
+
+    Attributes:
+        cloths: Innermost first.
+        body_frames: Body vertices [m], float32 [T, U, 3], Y up; None: no body.
+        body_faces: What cloth collides with, int32 [G, 3]; not every vertex need be used by a face.
+        frames: Number of frames T where there is no body.
+        fps: Frames per second.
+        wind: Velocity of the air in each frame [m/s], [T, 3]; None: still air.
+        settle: Frames simulated in the first pose, before the first frame that is returned.
+        gravity: Acceleration [m/s^2].
+    """
+
+    cloths: tuple[Cloth, ...]
+    body_frames: np.ndarray | None = None
+    body_faces: np.ndarray | None = None
+    frames: int = 0
+    fps: float = 30.0
+    wind: np.ndarray | None = None
+    settle: int = 15
+    gravity: tuple[float, float, float] = (0.0, -9.81, 0.0)
+
+    def __len__(self) -> int:
+        return self.frames if self.body_frames is None else len(self.body_frames)
+
+    @property
+    def starts(self) -> np.ndarray:
+        """First vertex of each cloth, and the number of all vertices: int [K + 1]."""
+        return np.concatenate([[0], np.cumsum([len(c.garment.vertices) for c in self.cloths])])
+
+
+class Teacher(Protocol):
+    """Simulates cloth."""
+
+    name: str
+
+    def simulate(self, scene: ClothScene) -> Iterator[np.ndarray]:
+        """Yields T frames, float32 [V, 3], cloths end to end; the first is the settled drape.
+
+        The caller stops early by leaving the loop; whatever the teacher holds is released then.
+
+        Raises:
+            TeacherError: The simulation could not run; the message says why and what to do.
+        """
+        ...
+
+    def simulate_many(self, scenes: list[ClothScene]) -> Iterator[list[np.ndarray | None]]:
+        """Several scenes at once, each in a world of its own: per frame one array a scene, None once it has ended."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on besides the scene, as plain values for a manifest: settings and versions."""
+        ...
+
+
+class TeacherError(RuntimeError):
+    """A physics teacher could not run, or failed on the way."""
+
+
+def make_teacher(name: Literal["newton", "blender"], device: str | None = "cpu") -> Teacher:
+    """A teacher by name.
+
+    Raises:
+        ValueError: Unknown name.
+        MissingExtra: What it needs is not installed.
+        TeacherError: Blender's environment has not been made.
+    """
+    if name == "newton":
+        from .newton_vbd import NewtonTeacher
+
+        return NewtonTeacher(device=device)
+    if name == "blender":
+        from .blender import BlenderTeacher
+
+        return BlenderTeacher()
+    raise ValueError(f"unknown teacher {name!r}; there are {', '.join(TEACHERS)}")

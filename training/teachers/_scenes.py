@@ -1,0 +1,112 @@
+"""What a scene must be for a teacher to simulate it, and what of it does not depend on the teacher."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from . import ClothScene, TeacherError
+
+
+def check_scenes(scenes: Sequence[ClothScene]) -> None:
+    """Refuses what would be simulated wrongly or read outside of arrays.
+
+    Raises:
+        TeacherError: Names the scene, the cloth, what is wrong, and what to do.
+    """
+    for number, scene in enumerate(scenes):
+        where = f"scene {number}: " if len(scenes) > 1 else ""
+        if not scene.cloths:
+            raise TeacherError(f"{where}there is no cloth to simulate")
+        for k, cloth in enumerate(scene.cloths):
+            name = f"{where}cloth {k} ({cloth.garment.name or 'no name'})"
+            start, rest = np.asarray(cloth.first), cloth.garment.vertices
+            if start.shape != rest.shape:
+                raise TeacherError(f"{name} starts from shape {list(start.shape)}, its rest mesh is {list(rest.shape)}")
+            if not np.isfinite(start).all():
+                raise TeacherError(f"{name}: {(~np.isfinite(start)).any(1).sum():,} start positions are not finite")
+            if not cloth.edge > 0:
+                raise TeacherError(f"{name}: its edge length must be positive, got {cloth.edge}")
+        if (scene.body_frames is None) != (scene.body_faces is None):
+            raise TeacherError(f"{where}give both body_frames and body_faces, or neither")
+        if len(scene) < 1:
+            raise TeacherError(f"{where}there are no frames; set `frames` where there is no body")
+        if scene.fps <= 0 or scene.settle < 0:
+            raise TeacherError(f"{where}fps {scene.fps} must be positive and settle {scene.settle} at least 0")
+        if scene.body_frames is not None:
+            _check_body(where, np.asarray(scene.body_frames), np.asarray(scene.body_faces))
+        if scene.wind is not None and np.shape(scene.wind) != (len(scene), 3):
+            raise TeacherError(f"{where}wind has shape {list(np.shape(scene.wind))}, needed is {[len(scene), 3]}")
+
+
+def _check_body(where: str, frames: np.ndarray, faces: np.ndarray) -> None:
+    if frames.ndim != 3 or frames.shape[2] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise TeacherError(
+            f"{where}body frames must have shape [T, U, 3] and faces [G, 3], not {frames.shape} and {faces.shape}"
+        )
+    if faces.min() < 0 or faces.max() >= frames.shape[1]:
+        raise TeacherError(
+            f"{where}body faces name vertices {faces.min()} to {faces.max()}, the body has {frames.shape[1]:,}"
+        )
+    bad = ~np.isfinite(frames).all((1, 2))
+    if bad.any():
+        raise TeacherError(
+            f"{where}{bad.sum():,} of {len(frames):,} body frames are not finite (first: {bad.argmax()})"
+        )
+
+
+def used_body(scene: ClothScene) -> tuple[np.ndarray, np.ndarray]:
+    """The body without vertices that no face uses: float32 [T, U', 3], and faces int32 [G, 3]; empty without a body."""
+    if scene.body_frames is None:
+        return np.zeros((len(scene), 0, 3), np.float32), np.zeros((0, 3), np.int32)
+    used, faces = np.unique(scene.body_faces, return_inverse=True)
+    frames = np.ascontiguousarray(np.asarray(scene.body_frames)[:, used], dtype=np.float32)
+    return frames, faces.reshape(-1, 3).astype(np.int32)
+
+
+class MovingFrame:
+    """A frame of reference that follows the body's centroid, smoothed over time; without a body it rests at the origin.
+
+    Args:
+        body_frames: Body vertices [m], float32 [T, U, 3].
+        settle: Frames before the first, in which the body stands still.
+
+    Time is counted in frames of the simulation, which has `settle` + T of them: at time t + 1, frame t is reached.
+    """
+
+    def __init__(self, body_frames: np.ndarray, settle: int):
+        self._count = settle + len(body_frames)
+        self._path = None
+        if body_frames.shape[1] and self._count > 1:
+            means = body_frames.mean(1).astype(np.float64)
+            means = np.concatenate([np.repeat(means[:1], settle, axis=0), means])
+            centroid = gaussian_filter1d(means, 2.0, axis=0, mode="nearest")
+            self._path = CubicSpline(np.arange(self._count) + 1.0, centroid)
+        elif body_frames.shape[1]:
+            self._fixed = body_frames[0].mean(0).astype(np.float64)
+        else:
+            self._fixed = np.zeros(3)
+
+    def origin(self, at: np.ndarray | float) -> np.ndarray:
+        """Where the frame is at some times [m], shape [..., 3]."""
+        if self._path is None:
+            return np.broadcast_to(self._fixed, (*np.shape(at), 3))
+        return self._path(np.clip(at, 1.0, self._count))
+
+
+def bound_to_body(points: np.ndarray, body_points: np.ndarray, body_faces: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Where points are on a body: nearest face int [P], barycentric coordinates [P, 3], height above it [P] [m]."""
+    import igl
+
+    points, body_points = points.astype(np.float64), body_points.astype(np.float64)
+    _, face, closest = igl.point_mesh_squared_distance(points, body_points, body_faces.astype(np.int64))
+    corners = body_points[body_faces[face]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = ((points - closest) * normal).sum(1)
+    foot = points - normal * height[:, None]
+    weights = np.asarray(igl.barycentric_coordinates(foot, corners[:, 0], corners[:, 1], corners[:, 2])).reshape(-1, 3)
+    return np.asarray(face), weights, height
