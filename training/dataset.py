@@ -1,14 +1,17 @@
-"""Sequences on disk: one folder each, arrays as .npy (memory-mapped when read), a JSON manifest; nothing pickled.
+"""Sequences on disk: one folder each, arrays as .npy, a JSON manifest; nothing pickled.
 
-The body is stored as rest mesh, skinning weights and bone transforms, a few hundred numbers a frame.
+    write_sequence(folder, arrays, manifest)      # arrays in floats (layout.ARRAYS), stored in few bytes (encoding)
+    sequence = Sequence.load(folder)              # sequence.garment, .vertices, .body(), .layers, .wind
+
+A body is stored as rest mesh, skinning weights and bone transforms where it has them, else as positions.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,63 +21,80 @@ import numpy as np
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
 from warpgarment.garment import Garment
+from warpgarment.io.atomic import atomic_folder
 from warpgarment.skinning import linear_blend_skinning
 
-ARRAYS = {
-    "garment_rest_vertices": np.float32,
-    "garment_faces": np.int32,
-    "pins": np.int32,
-    "garment_vertices": np.float32,
-    "body_rest_vertices": np.float32,
-    "body_faces": np.int32,
-    "collider_faces": np.bool_,
-    "bone_indices": np.uint8,
-    "bone_weights": np.float32,
-    "bone_transforms": np.float32,
-}
+from .encoding import decoded, encoded, stored_body, stored_transforms
+from .layout import AGAIN, ARRAYS, STORED, check_fit, expected
+from .set_manifest import DatasetMismatch, read_json, read_set_manifest, write_set_manifest
+
+__all__ = [
+    "ARRAYS", "FORMAT", "MANIFEST", "DatasetMismatch", "Layer", "Sequence", "list_sequences", "read_manifest",
+    "read_set_manifest", "stored_body", "stored_transforms", "write_sequence", "write_set_manifest",
+]  # fmt: skip
+
+FORMAT = 2
 MANIFEST = "manifest.json"
+_LARGE = ("garment_positions", "body_positions", "garment_vertices")  # mapped; others would cost an open file each
+_ONE_OF_TWO_BODIES = {"body_vertices", "bone_transforms"}
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One garment of an outfit.
+
+    Attributes:
+        name, category: From the manifest.
+        vertices, faces: Which of the sequence's vertices and faces are its own.
+        entry: All that the manifest says of it: name, category, material.
+    """
+
+    name: str
+    category: str
+    vertices: slice
+    faces: slice
+    entry: Mapping[str, Any]
 
 
 class Sequence:
-    """One simulated sequence: a garment on a moving body. Read one with :meth:`load`.
+    """One simulated sequence: garments on a moving body. Read one with :meth:`load`.
 
     Attributes:
         folder: Where it lies.
         manifest: Status, split, seed, parameters, figures, checksums.
     """
 
-    def __init__(self, folder: Path, manifest: dict[str, Any], arrays: dict[str, np.ndarray]):
-        self.folder, self.manifest, self._arrays = folder, manifest, arrays
+    def __init__(self, folder: Path, manifest: dict[str, Any], stored: dict[str, np.ndarray]):
+        self.folder, self.manifest, self._stored = folder, manifest, stored
 
     @classmethod
     def load(cls, folder: str | Path) -> Sequence:
-        """Reads a sequence; large arrays are memory-mapped.
+        """Reads a sequence. Positions are memory-mapped, and decoded when first asked for.
 
         Raises:
-            MeshError: The manifest or an array is missing, damaged, or of another shape or type.
+            MeshError: The manifest or an array is missing, damaged, of another type or shape, or does not fit the
+                others.
         """
         folder = Path(folder)
         manifest = read_manifest(folder)
-        arrays = {}
-        for name, dtype in ARRAYS.items():
-            try:
-                arrays[name] = np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
-            except (OSError, ValueError) as error:
-                raise MeshError(f"{folder.name}: {name}.npy cannot be read ({error}). Generate it again.") from error
-            if arrays[name].dtype != dtype:
-                raise MeshError(f"{folder.name}: {name}.npy is {arrays[name].dtype}, not {np.dtype(dtype)}.")
-        vertices, transforms = arrays["garment_vertices"], arrays["bone_transforms"]
-        if vertices.ndim != 3 or vertices.shape[1:] != arrays["garment_rest_vertices"].shape:
-            raise MeshError(
-                f"{folder.name}: garment_vertices has shape {list(vertices.shape)}, its rest mesh "
-                f"{list(arrays['garment_rest_vertices'].shape)}."
-            )
-        if len(vertices) != len(transforms):
-            raise MeshError(f"{folder.name}: {len(vertices)} frames of garment, {len(transforms)} of body.")
-        return cls(folder, manifest, arrays)
+        version, fps = manifest.get("format", 1), manifest.get("fps")
+        if version not in (1, FORMAT):
+            raise MeshError(f"{folder.name}: format {version!r} is not known, only 1 and {FORMAT}. Update warpgarment.")
+        if not (isinstance(fps, (int, float)) and 0 < fps < np.inf):
+            raise MeshError(f"{folder.name}: {MANIFEST} says {fps!r} frames per second. {AGAIN}")
+        schema = expected(version, {path.stem for path in folder.glob("*.npy")})
+        stored = {name: _read(folder, name) for name in schema}
+        check_fit(folder.name, stored, schema)
+        sequence = cls(folder, manifest, stored)
+        count = len(sequence.starts) - 1
+        described = manifest.get("garments") or [{}] * count
+        if not isinstance(described, list) or [type(entry) for entry in described] != [dict] * count:
+            raise MeshError(f"{folder.name}: {MANIFEST} does not describe {count} garments. {AGAIN}")
+        return sequence
 
     def __len__(self) -> int:
-        return len(self._arrays["garment_vertices"])
+        name = "garment_positions" if "garment_positions" in self._stored else "garment_vertices"
+        return len(self._stored[name])
 
     @property
     def name(self) -> str:
@@ -86,44 +106,98 @@ class Sequence:
         """Frames per second."""
         return float(self.manifest["fps"])
 
-    @property
+    @cached_property
     def vertices(self) -> np.ndarray:
-        """Garment vertices [m], memory-mapped float32 [T, V, 3]."""
-        return self._arrays["garment_vertices"]
+        """Garment vertices [m], float32 [T, V, 3]. A frame that was not finite is NaN throughout."""
+        return self._array("garment_vertices")
 
     @cached_property
     def garment(self) -> Garment:
-        """The rest mesh."""
-        return Garment(
-            np.array(self._arrays["garment_rest_vertices"]),
-            np.array(self._arrays["garment_faces"]),
-            pins=np.array(self._arrays["pins"]),
-            name=str(self.manifest.get("garment", self.name)),
+        """The rest mesh, of all garments together."""
+        rest, faces, pins = map(self._array, ("garment_rest_vertices", "garment_faces", "pins"))
+        try:
+            return Garment(rest, faces, pins=pins, name=str(self.manifest.get("garment", self.name)))
+        except MeshError as error:
+            raise MeshError(f"{self.name}: rest mesh: {error}") from None
+
+    @cached_property
+    def layers(self) -> tuple[Layer, ...]:
+        """The garments, innermost first."""
+        starts, count = self.starts, len(self.starts) - 1
+        alone = {"name": self.manifest.get("garment"), "category": self.manifest.get("category")}
+        entries = self.manifest.get("garments") or [alone] * count
+        owner = np.searchsorted(starts, self._array("garment_faces")[:, 0], side="right") - 1
+        first = np.searchsorted(owner, np.arange(count + 1))
+        return tuple(
+            Layer(
+                str(entries[k].get("name") or self.name),
+                str(entries[k].get("category") or ""),
+                slice(int(starts[k]), int(starts[k + 1])),
+                slice(int(first[k]), int(first[k + 1])),
+                entries[k],
+            )
+            for k in range(count)
         )
+
+    @property
+    def starts(self) -> np.ndarray:
+        """First vertex of each garment, and the number of all: int [K + 1]."""
+        return self._stored.get("garment_starts", np.array([0, len(self._stored["garment_rest_vertices"])]))
+
+    @property
+    def wind(self) -> np.ndarray | None:
+        """Velocity of the air in each frame [m/s], float32 [T, 3]; None: still air."""
+        return self._array("wind") if "wind" in self._stored else None
 
     def full_body(self) -> BodyMotion:
         """The whole body, for pictures."""
-        arrays = self._arrays
-        vertices = linear_blend_skinning(
-            arrays["body_rest_vertices"], arrays["bone_indices"], arrays["bone_weights"], arrays["bone_transforms"]
-        )
-        return BodyMotion(vertices, np.array(arrays["body_faces"]), self.fps)
+        return self.body_in(slice(None))
 
     def body(self) -> BodyMotion:
         """The faces cloth collides with (no hands and forearms), vertices compacted."""
-        return self.full_body().submesh(np.array(self._arrays["collider_faces"]))
+        return self.full_body().submesh(self._array("collider_faces"))
+
+    def body_in(self, frames: slice) -> BodyMotion:
+        """The whole body in some of the frames."""
+        if "body_positions" in self._stored:
+            vertices = self._array("body_vertices")[frames]
+        else:
+            rest, bones, weights = map(self._array, ("body_rest_vertices", "bone_indices", "bone_weights"))
+            vertices = linear_blend_skinning(rest, bones, weights, self._array("bone_transforms")[frames])
+        return BodyMotion(vertices, self._array("body_faces"), self.fps)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything as `write_sequence` takes it, so that a sequence of format 1 can be written anew."""
+        skinned = {"body_rest_vertices", "bone_indices", "bone_weights", "bone_transforms"}
+        left_out = skinned if "body_positions" in self._stored else {"body_vertices"}
+        left_out |= {name for name in ("garment_starts", "wind") if name not in self._stored}
+        return {name: self._array(name) for name in ARRAYS if name not in left_out}
+
+    def _array(self, name: str) -> np.ndarray:
+        return np.asarray(self._stored[name]) if self._is_plain else decoded(self._stored, name)
+
+    @property
+    def _is_plain(self) -> bool:
+        return self.manifest.get("format", 1) == 1
+
+
+def _read(folder: Path, name: str) -> np.ndarray:
+    """One array; copied into memory unless it is large."""
+    try:
+        array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="r")  # refuses whatever is pickled
+    except (OSError, ValueError, EOFError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise MeshError(f"{folder.name}: {name}.npy cannot be read ({reason}). {AGAIN}") from None
+    return array if name in _LARGE else np.array(array)
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a sequence folder.
 
     Raises:
-        MeshError: There is none, or it is not JSON.
+        MeshError: There is none, or it is not a JSON object.
     """
-    try:
-        return json.loads((folder / MANIFEST).read_text())
-    except (OSError, ValueError) as error:
-        raise MeshError(f"{folder} holds no readable {MANIFEST} ({error}).") from error
+    return read_json(Path(folder) / MANIFEST)
 
 
 def list_sequences(root: str | Path, split: str | None = None, status: str | None = "good") -> list[Path]:
@@ -141,25 +215,44 @@ def list_sequences(root: str | Path, split: str | None = None, status: str | Non
     if not root.is_dir():
         raise FileNotFoundError(f"no data set at {root}: make one with `warpgarment generate --out {root}`")
     found = []
-    for path in sorted(root.glob(f"*/{MANIFEST}")):
+    for path in sorted(root.glob(f"[!.]*/{MANIFEST}")):
         manifest = read_manifest(path.parent)
         if (split is None or manifest.get("split") == split) and (status is None or manifest.get("status") == status):
             found.append(path.parent)
     return found
 
 
-def write_sequence(folder: Path, arrays: dict[str, np.ndarray], manifest: dict[str, Any]) -> None:
+def write_sequence(folder: Path, arrays: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> None:
     """Writes a sequence beside its final place and moves it there, so that it is whole or absent.
 
-    A rejected sequence may leave arrays out; its manifest keeps parameters and reason.
+    Args:
+        folder: Where to; must not exist.
+        arrays: See `layout.ARRAYS`. A rejected sequence may have none; its manifest keeps parameters and reason.
+        manifest: Anything JSON knows; `format` and `checksums` (sha256 of every file) are added.
+
+    Raises:
+        FileExistsError: The folder exists.
+        MeshError: Arrays are missing, unknown, do not fit each other, or cannot be stored.
     """
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    folder = Path(folder)
+    if folder.exists():
+        raise FileExistsError(f"{folder} exists. Remove it to write the sequence again.")
+    unknown = sorted(set(arrays) - set(ARRAYS))
+    if unknown:
+        raise MeshError(f"{folder.name}: unknown arrays {', '.join(unknown)}. There are {', '.join(ARRAYS)}.")
+    if set(arrays) >= _ONE_OF_TWO_BODIES:
+        raise MeshError(f"{folder.name}: a body has either bone_transforms or body_vertices. Leave one out.")
+    try:
+        stored = encoded(arrays)
+    except MeshError as error:
+        raise MeshError(f"{folder.name}: {error}") from None
+    if arrays or manifest.get("status") == "good":
+        check_fit(folder.name, stored, expected(FORMAT, stored))
     checksums = {}
-    for name, array in arrays.items():
-        path = partial / f"{name}.npy"
-        np.save(path, np.ascontiguousarray(array, dtype=ARRAYS[name]), allow_pickle=False)
-        checksums[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
-    (partial / MANIFEST).write_text(json.dumps(manifest | {"checksums": checksums}, indent=1))
-    partial.rename(folder)
+    with atomic_folder(folder, "*") as partial:
+        for name in (name for name in STORED if name in stored):
+            path = partial / f"{name}.npy"
+            np.save(path, np.ascontiguousarray(stored[name]), allow_pickle=False)
+            checksums[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        content = {**manifest, "format": FORMAT, "checksums": checksums}
+        (partial / MANIFEST).write_text(json.dumps(content, indent=1), "utf-8")

@@ -87,7 +87,8 @@ class SequenceData:
         interaction, geodesics = cached(sequence, folder, cache, device)
         if len(interaction) + 1 < network.history + 1:
             raise UnusableSequence(f"the body has only {len(interaction) + 1} frames")
-        self.vertices = torch.as_tensor(np.array(recorded[: len(interaction) + 1]), device=device)
+        recorded = recorded[: len(interaction) + 1]
+        self.vertices = torch.as_tensor(recorded if recorded.flags.writeable else recorded.copy(), device=device)
         self.interaction = torch.from_numpy(_writable(interaction)).to(device)
         self.faces = torch.as_tensor(np.array(garment.faces, np.int32), device=device)
         self.rest = torch.as_tensor(np.array(garment.vertices, np.float32), device=device)

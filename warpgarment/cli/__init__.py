@@ -25,6 +25,7 @@ _EXTRAS = {
     "PIL": "view",
     "matplotlib": "view",
     "tensorboard": "train",
+    "ray": "cluster",
 }  # what to install where a module is missing
 
 
@@ -47,6 +48,7 @@ VERBS = {
         "training.generate", "GenerateConfig", "generate", "Simulate training sequences with a physics teacher."
     ),
     "train": Verb("training.train", "TrainConfig", "train", "Train a network on sequences."),
+    "dataset": Verb("cli.dataset", "Dataset", "run", "Check a data set, write a page about it, or import others."),
     "evaluate": Verb(
         "training.evaluate", "EvaluateConfig", "evaluate", "Roll a network out on test sequences and measure it."
     ),

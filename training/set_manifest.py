@@ -1,0 +1,138 @@
+"""`set.json`: what all sequences of a data set have in common, so that two sets are never mixed in one folder."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from warpgarment.errors import MeshError
+from warpgarment.io.atomic import atomic_file
+
+SET_MANIFEST = "set.json"
+PACKAGES = ("warpgarment", "newton", "warp-lang", "anny", "numpy", "scipy", "libigl", "gpytoolbox")
+
+
+class DatasetMismatch(ValueError):
+    """The folder holds a data set made with other options."""
+
+
+def write_set_manifest(
+    root: str | Path,
+    configuration: Mapping[str, Any],
+    teacher: Mapping[str, Any],
+    *,
+    numbers: Iterable[int] = (),
+    command: str = "",
+    versions: Mapping[str, str | None] | None = None,
+) -> dict[str, Any]:
+    """Writes what all sequences of a set have in common, or checks that it is what is written there already.
+
+    Args:
+        root: The data set's folder; made if missing.
+        configuration: What determines the sequences, as plain values; of these, `recipe`, `seed` and `held_out`
+            (categories that are only tested on) are known to `verify` and `card`.
+        teacher: The teacher's settings, as plain values.
+        numbers: Of the sequences planned; they join those that were planned before.
+        command: Makes the set again.
+        versions: Of packages; by default of those that data are made with.
+
+    Returns:
+        The manifest as it lies in the folder.
+
+    Raises:
+        DatasetMismatch: The set there has another configuration or teacher; names the fields.
+        MeshError: What is there is damaged.
+    """
+    content = {
+        "configuration": dict(configuration),
+        "teacher": dict(teacher),
+        "versions": package_versions() if versions is None else dict(versions),
+        "command": command,
+    }
+    new: dict[str, Any] = json.loads(json.dumps(content))  # as it will be read: tuples are lists
+    planned = set(numbers)
+    old = read_set_manifest(root)
+    if old is not None:
+        _check_same(Path(root), old, new)
+        planned |= set(planned_numbers(old))
+        new |= {key: old[key] for key in ("versions", "command") if old.get(key)}
+    new["numbers"] = _ranges(planned)
+    with atomic_file(Path(root) / SET_MANIFEST) as temporary:
+        temporary.write_text(json.dumps(new, indent=1), "utf-8")
+    return new
+
+
+def _check_same(root: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    different = []
+    for part in ("configuration", "teacher"):
+        before, now = old.get(part, {}), new[part]
+        for key in sorted({*before, *now}):
+            if before.get(key) != now.get(key):
+                different.append(f"{key} was {_short(before.get(key))}, is {_short(now.get(key))}")
+    if different:
+        raise DatasetMismatch(
+            f"{root} holds a set made with other options: {'; '.join(different)}. Choose another folder or the same "
+            "options."
+        )
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def read_set_manifest(root: str | Path) -> dict[str, Any] | None:
+    """What `write_set_manifest` wrote; None where the folder has none.
+
+    Raises:
+        MeshError: It is damaged.
+    """
+    path = Path(root) / SET_MANIFEST
+    return read_json(path) if path.exists() else None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        MeshError: The file is missing, damaged or holds something else.
+    """
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError("not a JSON object")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise MeshError(f"{path.parent} holds no readable {path.name} ({reason}).") from error
+    return content
+
+
+def planned_numbers(manifest: Mapping[str, Any]) -> list[int]:
+    """Numbers of all sequences that were planned so far."""
+    return [n for first, last in manifest.get("numbers", []) for n in range(first, last + 1)]
+
+
+def _ranges(numbers: Iterable[int]) -> list[list[int]]:
+    """{0, 1, 2, 5} -> [[0, 2], [5, 5]]."""
+    ranges: list[list[int]] = []
+    for n in sorted(numbers):
+        if ranges and n == ranges[-1][1] + 1:
+            ranges[-1][1] = n
+        else:
+            ranges.append([n, n])
+    return ranges
+
+
+def package_versions(names: Iterable[str] = PACKAGES) -> dict[str, str | None]:
+    """Installed versions of packages, None where one is not installed."""
+    return {name: _version(name) for name in names}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
