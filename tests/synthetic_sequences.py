@@ -64,18 +64,18 @@ def arrays(frames: int = 40, seed: int = 0, around: int = 12, rings: int = 6, pi
     }
 
 
-def write(root: Path, name: str, split: str = "train", *, spoil=None, **settings) -> Path:
-    """Writes one sequence; `spoil` may change its arrays first. Returns its folder."""
+def write(root: Path, name: str, split: str = "train", *, spoil=None, manifest=None, **settings) -> Path:
+    """Writes one sequence; `spoil` may change its arrays first, `manifest` has entries to add. Returns its folder."""
     content = arrays(**settings)
     if spoil is not None:
         spoil(content)
-    manifest = {
+    entries = {
         "status": "good", "reason": "", "split": split, "motion": "sway", "garment": "tube", "category": "tube",
         "body": "capsule", "seed": settings.get("seed", 0), "fps": 30.0, "frames": len(content["garment_vertices"]),
         "figures": {}, "versions": {},
     }  # fmt: skip
     folder = Path(root) / name
-    write_sequence(folder, content, manifest)
+    write_sequence(folder, content, entries | (manifest or {}))
     return folder
 
 

@@ -39,9 +39,7 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def loaded(data) -> SequenceData:
     folder = data / "train_0"
-    return SequenceData(
-        Sequence.load(folder), folder, interactions.default_cache(data), SMALL, torch.device("cpu")
-    )
+    return SequenceData(Sequence.load(folder), folder, interactions.default_cache(data), SMALL, torch.device("cpu"))
 
 
 def plain_sample(sequence: Sequence, t: int, history: int):
@@ -166,9 +164,7 @@ def test_mirror_commutes_with_features(loaded):
         return face_features(inverse, vertices, faces, none, centroids.mean(0, keepdim=True), found)[None]
 
     plain = features(vertices, faces, loaded.rest, now, after, body_faces)
-    other = features(
-        vertices * m, flipped, loaded.rest * m, now * m, after * m, body_faces[:, [0, 2, 1]].contiguous()
-    )
+    other = features(vertices * m, flipped, loaded.rest * m, now * m, after * m, body_faces[:, [0, 2, 1]].contiguous())
     still = torch.eye(3).expand(1, len(faces), 3, 3)
     nothing = NetworkOutput(still, torch.ones(1, len(faces), 3), torch.zeros(1, 1, 3))
     mirrored, _, _ = mirror(plain, torch.zeros(1, 1, 27), nothing, torch.tensor([True]))
@@ -240,9 +236,12 @@ def test_cache_is_keyed_by_content(tmp_path):
     interactions.cached(Sequence.load(folder), folder, tmp_path / "cache")
     key = interactions.key_of(folder)
     assert [p.name for p in (tmp_path / "cache").iterdir()] == [f"one-{key}"]
-    changed = np.load(folder / "garment_vertices.npy") + np.float32(0.001)
-    np.save(folder / "garment_vertices.npy", changed)
-    assert interactions.key_of(folder) != key
+    for name in ("garment_positions", "garment_boxes", "bone_rotations"):
+        changed = np.load(folder / f"{name}.npy")
+        changed.flat[0] += 1
+        np.save(folder / f"{name}.npy", changed)
+        assert interactions.key_of(folder) != key, name
+        key = interactions.key_of(folder)
 
 
 def config_for(data: Path, out: Path, **changes) -> train.TrainConfig:
@@ -289,7 +288,7 @@ def test_unusable_sequences_are_skipped_and_counted(data, tmp_path):
 
     synthetic_sequences.write(root, "nan", frames=14, spoil=spoil)
     corrupt = synthetic_sequences.write(root, "corrupt", frames=14)
-    (corrupt / "garment_vertices.npy").write_bytes(b"not an array")
+    (corrupt / "garment_positions.npy").write_bytes(b"not an array")
     skipped: dict[str, str] = {}
     config = config_for(root, tmp_path / "out")
     sequences = train.load_sequences(config, SMALL, torch.device("cpu"), skipped)

@@ -39,6 +39,10 @@ _SOURCES = (
     "garment_rest_vertices", "garment_faces", "garment_vertices", "body_rest_vertices", "body_faces", "collider_faces",
     "bone_indices", "bone_weights", "bone_transforms",
 )  # fmt: skip
+_SOURCES_2 = (
+    "garment_positions", "garment_boxes", "body_rest_positions", "body_rest_box", "bone_rotations", "bone_translations",
+    "bone_origins", "body_positions", "body_boxes",
+)  # fmt: skip
 
 
 class UnusableSequence(ValueError):
@@ -58,6 +62,11 @@ def key_of(folder: Path) -> str:
         path = Path(folder) / f"{name}.npy"
         digest.update(name.encode())
         digest.update(path.read_bytes() if path.exists() else b"-")
+    for name in _SOURCES_2:  # where there is none, the key is that of format 1
+        path = Path(folder) / f"{name}.npy"
+        if path.exists():
+            digest.update(name.encode())
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -64,7 +64,5 @@ def loss(
         velocity = parts[2].mean()
     else:
         velocity = torch.where(velocity_mask, parts[2], 0.0).sum() / velocity_mask.sum()
-    total = (
-        config.deformation * deformation + config.singular_values * singular_values + config.velocity * velocity
-    )
+    total = config.deformation * deformation + config.singular_values * singular_values + config.velocity * velocity
     return Losses(total, deformation, singular_values, velocity)

@@ -1,0 +1,57 @@
+"""The same work on a Ray cluster (extra `cluster`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from warpgarment.errors import MissingExtra
+
+from .workers import Done
+
+
+def on_cluster(
+    function: Callable[[Any], Any], items: list[Any], address: str, *, cpus: float = 1.0, gpus: float = 0.0
+) -> Iterator[Done]:
+    """Calls `function(item)` for every item as a Ray task; yields in the order they finish.
+
+    A task whose machine is lost is tried once more by Ray. What the function writes must lie on storage that all
+    machines share.
+
+    Args:
+        function: Of one item; sent to the cluster, where warpgarment must be installed.
+        items: What to work on.
+        address: Of the cluster; "local" starts one on this machine and stops it at the end.
+        cpus: Cores that a task occupies.
+        gpus: GPUs, or the share of one.
+
+    Raises:
+        MissingExtra: Ray is not installed.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise MissingExtra("cluster", "Running on a Ray cluster") from error
+
+    started = not ray.is_initialized()
+    if started:
+        ray.init(address=address, include_dashboard=False if address == "local" else None, log_to_driver=False)
+
+    @ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=1)
+    def task(item: Any) -> Any:
+        return function(item)
+
+    try:
+        waiting = {task.remote(item): item for item in items}
+        while waiting:
+            (ready, *_), _ = ray.wait(list(waiting), num_returns=1)
+            item = waiting.pop(ready)
+            try:
+                yield Done(item, ray.get(ready))
+            except ray.exceptions.RayTaskError as error:
+                yield Done(item, error=f"{type(error.cause).__name__}: {error.cause}")
+            except ray.exceptions.RayError as error:
+                yield Done(item, error=f"{type(error).__name__}: {str(error).splitlines()[0]}")
+    finally:
+        if started:
+            ray.shutdown()
