@@ -12,6 +12,7 @@ import pytest
 from warpgarment.training.dataset import DatasetMismatch, Sequence, list_sequences, read_manifest
 from warpgarment.training.generate import generate, make_sequences, numbers_to_make
 from warpgarment.training.recipes import GenerateConfig
+from warpgarment.training.verify import verify
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +40,13 @@ def test_sequences_are_whole_and_simulated(made, config):
         assert 1e-5 < moved.max() < 0.1
         assert sequence.manifest["figures"]["penetration"] < 0.01
         assert abs(len(sequence.garment.faces) - 500) < 150
+
+
+def test_what_is_made_passes_its_own_check(made):
+    """If this fails, `dataset verify` and the generator disagree on what a set is."""
+    report = verify(made)
+    assert report.problems == [], report
+    assert report.sequences == 2
 
 
 def test_a_run_goes_on_where_it_stopped(made, config):

@@ -14,21 +14,22 @@ from .bodies import RestBody, anny_bodies, bundled_body
 from .clearance import resolve_clearance
 from .encoding import stored_body, stored_transforms
 from .garments import make_garment
-from .motions import list_clips, read_clip, retarget
+from .motions import jumps, list_clips, read_clip, retarget
 from .outfits import make_outfit
 from .procedural import procedural
 from .recipes import BLEND, FPS, GenerateConfig, Plan
-from .seams import cut_seams
-from .skeleton import PoseSequence, arms_abducted, blended_in, facing_forward, mirrored, posed
+from .seams import cut_seams, parted
+from .skeleton import PoseSequence, arms_abducted, blended_in, facing_forward, longest_run, mirrored, posed
 from .teachers import Cloth
 
 ABDUCTION = 15.0  # upper arms are lifted off the torso by this much throughout [degrees]
 GAP = 0.02  # between limbs and torso under one garment [m]
 LAYER_GAP = 0.02  # more for every further one [m]
+PARTED = 0.008  # between the two sides of a cut at the start [m]
 
 
 class UnusableMotion(ValueError):
-    """A motion in which limbs and torso stay too close for clothes."""
+    """A motion in which limbs and torso stay too close for clothes, or that is torn."""
 
 
 def rest_body(plan: Plan) -> RestBody:
@@ -43,7 +44,7 @@ def rest_body(plan: Plan) -> RestBody:
 
 
 def body_motion(plan: Plan, config: GenerateConfig) -> tuple[RestBody, np.ndarray, np.ndarray]:
-    """The body of a plan and its motion: window of a clip, limbs cleared, blended in from the rest pose.
+    """The body of a plan and its motion: window of a clip, limbs cleared, torn frames cut, blended in from rest.
 
     Returns:
         The rest body, bone transforms float32 [T, B, 3, 4] and vertices [m] float32 [T, U, 3], as a sequence stores
@@ -59,14 +60,15 @@ def body_motion(plan: Plan, config: GenerateConfig) -> tuple[RestBody, np.ndarra
     if plan.mirror:
         poses = mirrored(body, poses)
     gap = GAP + LAYER_GAP * (len(plan.outfit.layers) - 1)
+    broken = jumps(body, poses)
     cleared = resolve_clearance(body, arms_abducted(body, poses, ABDUCTION), gap)
-    kept = cleared.longest
-    poses = cleared.poses[kept]
+    poses = cleared.poses[longest_run(cleared.unresolved | broken)]
     least = min(config.least_frames, plan.frames)
     if len(poses) < least:
         raise UnusableMotion(
-            f"limbs and torso come closer than {gap * 1e3:.0f} mm: the longest stretch of {plan.motion} without is "
-            f"{len(poses)} of {len(cleared.poses)} frames, fewer than {least}."
+            f"of {len(broken)} frames of {plan.motion}, limbs and torso come closer than {gap * 1e3:.0f} mm in "
+            f"{int(cleared.unresolved.sum())} and the capture jumps in {int(broken.sum())}: {len(poses)} in a row "
+            f"without are fewer than {least}."
         )
     _, transforms = posed(body, blended_in(body, facing_forward(poses), BLEND))
     transforms = stored_transforms(transforms)
@@ -95,8 +97,10 @@ def clothed(plan: Plan, body: RestBody, transforms: np.ndarray) -> tuple[tuple[G
     if plan.seams:
         made = tuple((cut_seams(garment, plan.seams), edge) for garment, edge in made)
     first = transforms[0, 0].astype(np.float64)
-    cloths = tuple(
-        Cloth(garment, edge, (garment.vertices @ first[:, :3].T + first[:, 3]).astype(np.float32), material)
-        for (garment, edge), material in zip(made, plan.materials, strict=True)
-    )
-    return tuple(garment for garment, _ in made), cloths
+    cloths = []
+    for (garment, edge), material in zip(made, plan.materials, strict=True):
+        start = garment.vertices @ first[:, :3].T + first[:, 3]
+        if plan.seams:
+            start = parted(garment, start, PARTED)
+        cloths.append(Cloth(garment, edge, start.astype(np.float32), material))
+    return tuple(garment for garment, _ in made), tuple(cloths)

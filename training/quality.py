@@ -29,7 +29,7 @@ class Limits:
     stretch: float = 0.30
     largest_stretch: float = 1.0
     slip: float = 0.15
-    layer_inside: float = 0.03
+    layer_inside: float = 0.01
 
 
 @dataclass

@@ -21,6 +21,7 @@ from warpgarment.garment import Garment
 from ..materials import Material
 
 TEACHERS = ("newton", "blender")
+LAYER_FRICTION = 0.2  # between cloths: Newton has one coefficient for all worlds it simulates at once
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,9 @@ def make_teacher(name: Literal["newton", "blender"], device: str | None = "cpu")
         TeacherError: Blender's environment has not been made.
     """
     if name == "newton":
-        from .newton_vbd import NewtonTeacher
+        from .newton_vbd import NewtonSettings, NewtonTeacher
 
-        return NewtonTeacher(device=device)
+        return NewtonTeacher(NewtonSettings(layer_friction=LAYER_FRICTION), device=device)
     if name == "blender":
         from .blender import BlenderTeacher
 

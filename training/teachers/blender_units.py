@@ -54,6 +54,7 @@ class BlenderSettings:
             far as its modulus says, depending on how its mesh lies, at 1 from 0.93 to 1.03.
         distance: Kept between cloth and body [m].
         self_distance: Kept between cloth and cloth [m]; at most a quarter of a garment's mean edge.
+        layer_distance: The same where a scene has several cloths: with less, layers go through each other.
         drag: Coefficient of the air's force on a face, along its normal; 0 is a vacuum.
         air_speed: Blender's air resistance is linear in the speed; it is right at this speed [m/s] plus the wind's.
         threads: Of Blender, 1 or all (0). Where the system cannot hold a program to one processor, all.
@@ -65,6 +66,7 @@ class BlenderSettings:
     compression: float = 0.03
     distance: float = 4e-3
     self_distance: float = 4e-3
+    layer_distance: float = 9e-3
     drag: float = DRAG
     air_speed: float = 1.0
     threads: int = 1
@@ -165,7 +167,8 @@ def blender_numbers(scene: ClothScene, settings: BlenderSettings) -> tuple[dict[
     tension, bending, ratios = tension * mass, bending * mass, mass / masses
     damping = float(shares @ [m.damping * k * r for m, k, r in zip(materials, springs, ratios, strict=True)]) / f
     friction = min(80.0, 100.0 * float(np.mean([m.friction for m in materials])))
-    apart = min(settings.self_distance, *(0.25 * sheet.edge for sheet in sheets))
+    apart = settings.self_distance if len(sheets) == 1 else settings.layer_distance
+    apart = min(apart, *(0.25 * sheet.edge for sheet in sheets))
 
     numbers = {
         "threads": settings.threads,
