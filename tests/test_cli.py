@@ -53,7 +53,7 @@ def test_help_imports_nothing_heavy() -> None:
     code = "import sys; from warpgarment.cli import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert set(result.stderr.split()).isdisjoint({"torch", "warp", "numpy", "scipy", "tyro"})
-    for verb in ("demo", "simulate", "generate", "train", "evaluate", "bench", "view", "convert", "doctor"):
+    for verb in ("demo", "simulate", "generate", "dataset", "train", "evaluate", "bench", "view", "convert", "doctor"):
         assert f"\n  {verb}" in result.stdout
 
 
@@ -111,6 +111,34 @@ def test_convert_keeps_positions(scene) -> None:
     np.testing.assert_array_equal(after.faces, before.faces)
     assert cli.main(["convert", str(scene / "body.npz"), str(scene / "d.npz"), "--fps", "60"]) == 0
     assert BodyMotion.load(scene / "d.npz").vertices.shape[0] == 9
+
+
+def test_an_animation_becomes_part_of_a_data_set(scene, capsys) -> None:
+    """Own simulations in other units cannot be trained on, or become a hundred times too large. 16-bit: 1e-5 m."""
+    from warpgarment.garment import Garment
+    from warpgarment.training.dataset import Sequence
+
+    rest = Garment.load(scene / "band.obj", unit="cm")
+    lift = np.float32([0, 0.01, 0]) * np.arange(5, dtype=np.float32)[:, None, None]
+    frames = rest.vertices + lift
+    GarmentMotion(frames * 100, rest.faces, 30.0).save(scene / "cache.pc2")
+    common = ["dataset", "import", scene / "cache.pc2", scene / "set" / "00000_band", "--body", scene / "body.npz"]
+    common += ["--rest", scene / "band.obj"]
+    text = _error(capsys, *common)
+    assert "unit" in text  # a garment a hundred times the body's size
+    assert not (scene / "set").exists() or not any((scene / "set").iterdir())
+    units = ["--unit", "cm", "--body-unit", "m", "--split", "test", "--motion", "lift"]
+    assert cli.main([*map(str, common), *units]) == 0
+    sequence = Sequence.load(scene / "set" / "00000_band")
+    np.testing.assert_allclose(sequence.vertices, frames, atol=1e-5)
+    np.testing.assert_allclose(sequence.garment.vertices, rest.vertices, atol=1e-6)
+    assert sequence.manifest["split"] == "test"
+    assert sequence.manifest["motion"] == "lift"
+    capsys.readouterr()
+    assert cli.main(["dataset", "verify", str(scene / "set"), "--json", str(scene / "report.json")]) == 0
+    assert "1 sequences, 5 frames" in capsys.readouterr().out
+    (scene / "set" / "00000_band" / "garment_faces.npy").write_bytes(b"")
+    assert "garment_faces.npy" in _error(capsys, "dataset", "verify", scene / "set")
 
 
 def test_view_draws_without_a_display(scene) -> None:

@@ -60,5 +60,5 @@ def test_the_longest_stretch_that_is_whole_is_kept(config, monkeypatch):
     _, cut, _ = placement.body_motion(plan, config)
     assert len(whole) - len(cut) == 7
     monkeypatch.setattr(placement, "jumps", lambda body, poses: np.arange(len(poses)) % 4 == 0)
-    with pytest.raises(placement.UnusableMotion, match="jumps in 5: 3 in a row"):
+    with pytest.raises(placement.UnusableMotion, match="jumps in 5; 3 in a row"):
         placement.body_motion(plan, config)

@@ -66,9 +66,9 @@ def body_motion(plan: Plan, config: GenerateConfig) -> tuple[RestBody, np.ndarra
     least = min(config.least_frames, plan.frames)
     if len(poses) < least:
         raise UnusableMotion(
-            f"of {len(broken)} frames of {plan.motion}, limbs and torso come closer than {gap * 1e3:.0f} mm in "
-            f"{int(cleared.unresolved.sum())} and the capture jumps in {int(broken.sum())}: {len(poses)} in a row "
-            f"without are fewer than {least}."
+            f"no room for clothes: limbs and torso come closer than {gap * 1e3:.0f} mm in "
+            f"{int(cleared.unresolved.sum())} of {len(broken)} frames of {plan.motion}, and the capture jumps in "
+            f"{int(broken.sum())}; {len(poses)} in a row without are fewer than {least}."
         )
     _, transforms = posed(body, blended_in(body, facing_forward(poses), BLEND))
     transforms = stored_transforms(transforms)

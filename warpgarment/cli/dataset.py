@@ -10,6 +10,7 @@ from typing import Literal
 import tyro
 
 from ..io.atomic import atomic_file
+from . import UsageError
 
 
 @dataclass
@@ -44,8 +45,18 @@ class Import:
     """Folder of the sequence, inside the data set's folder; must not exist."""
     body: Path | None = None
     """The body's animation; the data sets above hold poses only, see docs/readers.md."""
+    rest: Path | None = None
+    """The garment's rest shape (mesh file); by default the mesh beside a .pc2, else the first frame."""
     split: Literal["train", "validation", "test"] = "train"
     """What the sequence is for."""
+    motion: str | None = None
+    """Name of the motion, by which `verify` finds those both trained and tested on; by default what the files say."""
+    fps: float | None = None
+    """Frames per second, where the files do not say, or say something else."""
+    unit: Literal["m", "dm", "cm", "mm", "in"] | None = None
+    """Length unit of animation files."""
+    body_unit: Literal["m", "dm", "cm", "mm", "in"] | None = None
+    """That of the body, where it is another."""
     clean: bool = False
     """Repair rest meshes that have defects."""
 
@@ -62,15 +73,28 @@ def run(options: Dataset) -> None:
     if isinstance(options.command, Verify):
         _verify(options.command)
     elif isinstance(options.command, Import):
-        from ..training.readers import read_recording, write_as_sequence
-
-        chosen = options.command
-        recording = read_recording(chosen.source, body=chosen.body, clean=chosen.clean)
-        print(f"wrote {write_as_sequence(recording, chosen.out, split=chosen.split)}")
+        _import(options.command)
     else:
         from ..training.card import write_card
 
         print(f"wrote {write_card(options.command.root, options.command.out, pictures=options.command.pictures)}")
+
+
+_UNUSED = {"cloth3d": ("rest", "unit", "body_unit"), "vto": ("fps", "unit", "body_unit"),
+           "dlayers": ("rest", "fps", "unit", "body_unit")}  # fmt: skip
+
+
+def _import(options: Import) -> None:
+    from ..training.readers import detect, read_recording, write_as_sequence
+
+    kind = detect(options.source)
+    names = ("body", "rest", "fps", "unit", "body_unit")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    for name in _UNUSED.get(kind, ()):
+        if name in given:
+            raise UsageError(f"--{name.replace('_', '-')}: a {kind} sample says this itself. Leave the option out.")
+    recording = read_recording(options.source, kind, clean=options.clean, **given)
+    print(f"wrote {write_as_sequence(recording, options.out, split=options.split, motion=options.motion)}")
 
 
 def _verify(options: Verify) -> None:
