@@ -52,7 +52,7 @@ def page(facts: Facts, drawn: Mapping[str, Values], reasons: Counter[str]) -> st
         *_made(facts),
         "## What is in it",
         "",
-        *_counts(good),
+        *counts(good),
         *_by_count("Bodies", Counter(map(_kind_of_body, good))),
         *_by_count("Motions", Counter(str(m.get("motion")) for m in good)),
     ]
@@ -61,7 +61,7 @@ def page(facts: Facts, drawn: Mapping[str, Values], reasons: Counter[str]) -> st
             picture = f"![{_HEADINGS[name]}](card/{name}.png)"
             lines += [f"## {_HEADINGS[name]}", "", *_summary(values), picture, ""]
     lines += ["## Rejections", "", *_rejections(facts, reasons)]
-    return "\n".join([*lines, "## Licences and credits", "", *_credits(facts)]) + "\n"
+    return "\n".join([*lines, "## Licences and credits", "", *credits(facts)]) + "\n"
 
 
 def _made(facts: Facts) -> list[str]:
@@ -97,7 +97,8 @@ def _command(common: Mapping[str, Any]) -> str:
     return " ".join(["warpgarment generate --out DIR", *options])
 
 
-def _counts(good: Sequence[Mapping[str, Any]]) -> list[str]:
+def counts(good: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A table of sequences and frames by category and split."""
     splits = [s for s in SPLITS if any(m.get("split") == s for m in good)]
     rows = []
     for category in [*sorted({str(m.get("category", "-")) for m in good}), "together"]:
@@ -144,7 +145,8 @@ def _rejections(facts: Facts, reasons: Counter[str]) -> list[str]:
     return [*lines, *table(["reason", "attempts"], reasons.most_common()), "![Rejections](card/rejections.png)", ""]
 
 
-def _credits(facts: Facts) -> list[str]:
+def credits(facts: Facts) -> list[str]:
+    """Whom bodies, motions and garments of a set are owed to, one line each."""
     good = list(facts.good.values())
     motions = {str(m.get("motion")) for m in good}
     kinds = set(map(_kind_of_body, good))

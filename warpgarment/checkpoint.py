@@ -1,7 +1,8 @@
-"""Checkpoints: one safetensors file that holds the weights, the statistics and, as JSON, the `NetworkConfig`.
+"""Checkpoints: safetensors that hold the weights, the statistics and, as JSON, the `NetworkConfig`.
 
-Metadata keys: `format` ("warpgarment.network"), `format_version`, `config`, and `notes`, a JSON object for whatever a
-training run wants to say about itself. Nothing in a checkpoint is executed when it is read.
+One file, or a folder of shards with an index (`shards.py`). Metadata keys: `format` ("warpgarment.network"),
+`format_version`, `config`, and `notes`, a JSON object for whatever a training run wants to say about itself. Nothing in
+a checkpoint is executed when it is read.
 """
 
 from __future__ import annotations
@@ -9,21 +10,22 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 
+from warpgarment import hub, shards
 from warpgarment.errors import CheckpointError
+from warpgarment.io.atomic import atomic_file
 from warpgarment.network import STATISTICS, ManifoldAwareTransformer, NetworkConfig
 
 FORMAT = "warpgarment.network"
 FORMAT_VERSION = 1
 WEIGHTS = Path(__file__).parent / "assets" / "weights"  # networks that ship with the package
+LATER = {"replace_singular_values"}  # settings that older checkpoints do not have: their default is how it was then
 _DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 
@@ -33,18 +35,21 @@ def save(
     *,
     dtype: torch.dtype | None = None,
     notes: Mapping[str, object] | None = None,
+    max_shard_bytes: int | None = None,
 ) -> None:
-    """Writes a checkpoint: to a temporary file beside it, then renamed, so that nobody reads half of one.
+    """Writes a checkpoint: beside its place, then renamed, so that nobody reads half of one.
 
     Args:
         network: What to write.
-        path: A file; its folder must exist.
+        path: A file, or with `max_shard_bytes` a folder.
         dtype: Of the weights in the file, float32 (None), bfloat16 or float16; statistics are always float32.
         notes: Anything JSON can hold, kept in the metadata.
+        max_shard_bytes: Write a folder with an index, in the Hugging Face layout, no file of which is larger.
 
     Raises:
         CheckpointError: A weight or statistic is not finite.
-        ValueError: Another dtype.
+        ValueError: Another dtype, or a tensor that is larger than a shard may be.
+        FileExistsError: The folder holds something else than a checkpoint.
     """
     dtype = dtype or torch.float32
     if dtype not in _DTYPES:
@@ -61,47 +66,34 @@ def save(
         "config": json.dumps(dataclasses.asdict(network.config)),
         "notes": json.dumps(dict(notes or {})),
     }
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(serialise(tensors, metadata=metadata))
-            file.flush()
-            os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp makes files that only their owner can read
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    if max_shard_bytes is not None:
+        shards.write(Path(path), tensors, metadata, max_shard_bytes)
+        return
+    with atomic_file(Path(path)) as temporary:
+        temporary.write_bytes(serialise(tensors, metadata=metadata))
 
 
 def load(path: str | os.PathLike[str], *, device: torch.device | str | None = None) -> ManifoldAwareTransformer:
     """Reads a checkpoint.
 
     Args:
-        path: A file that `save` wrote.
+        path: A file or folder that `save` wrote.
         device: Where the network goes; the CPU unless said otherwise.
 
     Returns:
         The network in float32 and in evaluation mode.
 
     Raises:
-        CheckpointError: No file, a truncated or foreign one, or one whose settings or tensors do not fit; says which.
+        CheckpointError: No file, a truncated or foreign one, shards that do not belong together, or settings or tensors
+            that do not fit; says which.
     """
-    config, _ = read_metadata(path)
+    contents = shards.contents(path)
+    path = contents.path
+    config, _ = _described(contents)
     network = ManifoldAwareTransformer(config)
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    tensors = {}
-    try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
-            _check_tensors(path, expected, found)
-            for name in expected:
-                tensors[name] = file.get_tensor(name)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path}: cannot be read ({error}); the file is damaged, get it again") from error
+    _check_tensors(path, expected, contents.shapes)
+    tensors = contents.tensors()
     for name, tensor in tensors.items():
         if tensor.dtype not in _DTYPES:
             raise CheckpointError(f"{path}: {name} is {str(tensor.dtype)[6:]}, expected a floating-point tensor")
@@ -114,20 +106,65 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
 
 
 def read_metadata(path: str | os.PathLike[str]) -> tuple[NetworkConfig, dict[str, object]]:
-    """The settings and the notes of a checkpoint, without its weights.
+    """The settings and the notes of a checkpoint, file or folder, without its weights.
 
     Raises:
         CheckpointError: As `load`.
     """
-    if not Path(path).is_file():
-        raise CheckpointError(f"{path}: no such file")
+    return _described(shards.contents(path))
+
+
+def find(name: str | os.PathLike[str], *, device: torch.device | str | None = None) -> Path:
+    """The checkpoint of a name. What lies at a path of that name wins over what ships, and that over the Hub.
+
+    Args:
+        name: A checkpoint file, or a folder that holds one; "default" or the name of a network that ships; or a
+            repository of the Hugging Face Hub, `owner/name` or `owner/name@revision`, which is fetched.
+        device: Where it is going to run, which decides what "default" is: on a GPU `base`, where that ships, else what
+            default.txt among the weights names. None: a GPU where there is one, as in `Simulator`.
+
+    Returns:
+        A file, or a folder of shards.
+
+    Raises:
+        CheckpointError: There is none, or several; says what there is and what was tried.
+        MissingExtra: It can only be a repository, and huggingface-hub is not installed.
+    """
+    if Path(name).exists():
+        return shards.locate(name)
+    ships = _shipped()
+    wanted = os.fspath(name)
+    if wanted == "default":
+        wanted = _default(ships, device)
+    if wanted in ships:
+        return shards.locate(ships[wanted])
+    there = ", ".join(sorted(ships)) if ships else "none in this installation"
+    tried = f"no network {wanted!r}: neither a file, a folder, nor one that ships ({there})"
+    if not hub.is_repository(wanted):
+        raise CheckpointError(tried)
+    folder = hub.fetch(wanted, tried)
     try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            metadata = file.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(
-            f"{path}: not a safetensors file, or one cut short ({error}); get it again or check the path"
-        ) from error
+        return shards.locate(folder)
+    except CheckpointError as error:
+        raise CheckpointError(f"{wanted} on the Hugging Face Hub holds no network: {error}") from error
+
+
+def _shipped() -> dict[str, Path]:
+    """Networks of the package by name: files, and folders of shards."""
+    files = {file.stem: file for file in WEIGHTS.glob("*.safetensors")}
+    return files | {index.parent.name: index.parent for index in WEIGHTS.glob(f"*/{shards.INDEX}")}
+
+
+def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
+    gpu = torch.cuda.is_available() if device is None else torch.device(device).type != "cpu"
+    if gpu and "base" in ships:
+        return "base"
+    pointer = WEIGHTS / "default.txt"
+    return pointer.read_text(encoding="utf-8").strip() if pointer.is_file() else "default"
+
+
+def _described(contents: shards.Contents) -> tuple[NetworkConfig, dict[str, object]]:
+    path, metadata = contents.path, contents.metadata
     if metadata.get("format") != FORMAT:
         raise CheckpointError(f"{path}: a safetensors file, but no warpgarment network (format {FORMAT!r} is missing)")
     version = metadata.get("format_version", "")
@@ -137,35 +174,6 @@ def read_metadata(path: str | os.PathLike[str]) -> tuple[NetworkConfig, dict[str
         )
     settings = _json_object(path, "config", metadata)
     return _config(path, settings), _json_object(path, "notes", metadata)
-
-
-def find(name: str | os.PathLike[str]) -> Path:
-    """The file of a network that ships, or that lies in a file or folder of that name.
-
-    Args:
-        name: "default", the name of a network that ships, a checkpoint file, or a folder that holds one.
-
-    Raises:
-        CheckpointError: There is none, or several; says what there is.
-    """
-    path = Path(name)
-    if path.is_file():
-        return path
-    if path.is_dir():
-        files = sorted(path.glob("best.safetensors")) or sorted(path.glob("*.safetensors"))  # best: a training run's
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files) or "none"
-            raise CheckpointError(f"{path}: a folder must hold one .safetensors file, found {names}; name the file")
-        return files[0]
-    shipped = sorted(file.stem for file in WEIGHTS.glob("*.safetensors"))
-    wanted = os.fspath(name)
-    if wanted == "default":
-        pointer = WEIGHTS / "default.txt"
-        wanted = pointer.read_text(encoding="utf-8").strip() if pointer.is_file() else "default"
-    if wanted in shipped:
-        return WEIGHTS / f"{wanted}.safetensors"
-    there = ", ".join(shipped) if shipped else "none in this installation"
-    raise CheckpointError(f"no network {wanted!r}: neither a file, a folder, nor one that ships ({there})")
 
 
 def _check_tensors(path: object, expected: Mapping[str, tuple], found: Mapping[str, tuple]) -> None:
@@ -195,7 +203,7 @@ def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
     unknown = sorted(settings.keys() - fields.keys())
     if unknown:
         raise CheckpointError(f"{path}: unknown settings {', '.join(unknown)}; written by a newer warpgarment?")
-    missing = sorted(fields.keys() - settings.keys())
+    missing = sorted(fields.keys() - settings.keys() - LATER)
     if missing:
         raise CheckpointError(f"{path}: settings {', '.join(missing)} are missing")
     for name, value in settings.items():

@@ -71,13 +71,14 @@ class Simulator:
         """A simulator with a trained network.
 
         Args:
-            name: "default", the name of a network that ships, a checkpoint file, or a folder that holds one.
+            name: "default" (which depends on the device), the name of a network that ships, a checkpoint file, a folder
+                that holds one, or a Hugging Face repository `owner/name[@revision]` (extra `hub`).
             device: As in the constructor, and so are the options.
 
         Raises:
-            CheckpointError: There is no such network, or its file is damaged.
+            CheckpointError, MissingExtra: There is no such network, it is damaged, or cannot be fetched.
         """
-        return cls(checkpoint.load(checkpoint.find(name)), device, **options)
+        return cls(checkpoint.load(checkpoint.find(name, device=device)), device, **options)
 
     def rollout(
         self,

@@ -26,6 +26,7 @@ _EXTRAS = {
     "matplotlib": "view",
     "tensorboard": "train",
     "ray": "cluster",
+    "huggingface_hub": "hub",
 }  # what to install where a module is missing
 
 
