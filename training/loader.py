@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 
 import numpy as np
+import torch
 
 from warpgarment.training.pushforward import Pool
 from warpgarment.training.samples import Batch, SampleBuilder
@@ -58,16 +59,26 @@ class Loader:
         share: Share of samples from the pool, where it has any that fit.
         splits: Number of subsets that a garment's faces are split into at a step; one of them is used.
         depth: Batches built ahead; 0 builds them when asked, without a thread.
+        part: The samples of each batch that this process trains on.
     """
 
     def __init__(
-        self, builder: SampleBuilder, plan: Plan, pool: Pool, share: float, splits: Callable[[int], int], depth: int = 3
+        self,
+        builder: SampleBuilder,
+        plan: Plan,
+        pool: Pool,
+        share: float,
+        splits: Callable[[int], int],
+        depth: int = 3,
+        part: slice = slice(None),
     ) -> None:
         self.builder, self.plan, self.pool, self.share = builder, plan, pool, share
-        self.splits, self.depth = splits, depth
+        self.splits, self.depth, self.part = splits, depth, part
+        # A stream of its own: what a batch waits for is not the training step, nor the other way round
+        self._stream = torch.cuda.Stream(builder.device) if builder.device.type == "cuda" else None
 
-    def build(self, step: int, *, splits: int | None = None) -> Batch:
-        """The batch of a step; `splits` overrides the schedule's."""
+    def build(self, step: int, *, splits: int | None = None, part: slice | None = None) -> Batch:
+        """The batch of a step; `splits` and `part` override the schedule's and the process's."""
         rng = np.random.default_rng((self.plan.seed, 1, step))
         picks = self.plan.picks(step)
         splits = self.splits(step) if splits is None else splits
@@ -78,17 +89,19 @@ class Loader:
             if len(fitting) and rng.random() < self.share:
                 s, t, displacements[b] = self.pool.entry(*fitting[rng.integers(len(fitting))])
                 picks[b] = (s, t)
-        return self.builder.build(picks, faces, rng, displacements)
+        return self.builder.build(picks, faces, rng, displacements, self.part if part is None else part)
 
     def batches(self, start: int, stop: int) -> Iterator[Batch]:
         """The batches of steps start..stop-1, in order."""
         if self.depth == 0:
             yield from map(self.build, range(start, stop))
             return
+        if self._stream:
+            self._stream.wait_stream(torch.cuda.current_stream(self.builder.device))
         ready: queue.Queue = queue.Queue(maxsize=self.depth)
         stopped = threading.Event()
 
-        def hand_over(item: Batch | BaseException) -> bool:
+        def hand_over(item: tuple[Batch, torch.cuda.Event | None] | BaseException) -> bool:
             while not stopped.is_set():
                 try:
                     ready.put(item, timeout=0.2)
@@ -99,9 +112,11 @@ class Loader:
 
         def work() -> None:
             try:
-                for step in range(start, stop):
-                    if not hand_over(self.build(step)):
-                        return
+                with torch.cuda.stream(self._stream):  # of None: nothing
+                    for step in range(start, stop):
+                        batch = self.build(step)
+                        if not hand_over((batch, self._stream.record_event() if self._stream else None)):
+                            return
             except BaseException as error:  # raised where the batch is asked for
                 hand_over(error)
 
@@ -109,10 +124,22 @@ class Loader:
         thread.start()
         try:
             for _ in range(start, stop):
-                batch = ready.get()
-                if isinstance(batch, BaseException):
-                    raise batch
+                item = ready.get()
+                if isinstance(item, BaseException):
+                    raise item
+                batch, built = item
+                if built is not None:
+                    _adopt(batch, built)
                 yield batch
         finally:
             stopped.set()
             thread.join()
+
+
+def _adopt(batch: Batch, built: torch.cuda.Event) -> None:
+    """Makes the current stream wait for a batch of another one, and its memory wait for the current stream."""
+    stream = torch.cuda.current_stream(batch.features.device)
+    stream.wait_event(built)
+    for tensor in (*batch[:5], *batch.target):
+        if isinstance(tensor, torch.Tensor):
+            tensor.record_stream(stream)

@@ -43,8 +43,9 @@ def loss(
     network: ManifoldAwareTransformer,
     config: LossConfig,
     velocity_mask: torch.Tensor | None = None,
+    components: torch.Tensor | None = None,
 ) -> Losses:
-    """Loss of a batch.
+    """Loss of a batch, in float32.
 
     Args:
         predicted: Normalised output of the network: [B,N,9], [B,N,3], [B,C,3].
@@ -52,17 +53,19 @@ def loss(
         network: Whose standard deviations turn normalised differences into physical ones.
         config: Weights and units.
         velocity_mask: True where a component is real, [B,C]; None where all are.
+        components: Number of components that the velocity term is a mean over, a scalar; None: those of this batch. For
+            a part of a batch, the whole batch's number times the share that the part is: then the mean over equal parts
+            is the loss of the whole.
     """
-    scale = [torch.ones(())] * 3
+    parts = [(a.float() - b).abs() for a, b in zip(predicted, target, strict=True)]
     if config.units == "physical":
-        scale = [network.psi_std, network.singular_value_std, network.q_std]
-    parts = [
-        ((a.float() - b).abs() * s.to(b.device)).sum(dim=-1) for a, b, s in zip(predicted, target, scale, strict=True)
-    ]
-    deformation, singular_values = parts[0].mean(), parts[1].mean()
-    if velocity_mask is None:
-        velocity = parts[2].mean()
-    else:
-        velocity = torch.where(velocity_mask, parts[2], 0.0).sum() / velocity_mask.sum()
+        scale = (network.psi_std, network.singular_value_std, network.q_std)
+        parts = [part * s for part, s in zip(parts, scale, strict=True)]
+    deformation, singular_values, velocity = (part.sum(dim=-1) for part in parts)
+    deformation, singular_values = deformation.mean(), singular_values.mean()
+    if velocity_mask is not None:
+        velocity = torch.where(velocity_mask, velocity, 0.0)
+        components = velocity_mask.sum() if components is None else components
+    velocity = velocity.mean() if components is None else velocity.sum() / components
     total = config.deformation * deformation + config.singular_values * singular_values + config.velocity * velocity
     return Losses(total, deformation, singular_values, velocity)

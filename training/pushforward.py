@@ -4,7 +4,7 @@ A few short rollouts start from recorded history (or cold, from frame 0) at rand
 steps the newest k frames differ from the recorded ones by what the network did wrong; these differences override the
 newest frames of a sample's history, whose answer then leads back to the recorded motion. The pool is refreshed every
 so many steps; between refreshes it does not change, and it is part of the saved training state, so that resumed runs
-see the same samples.
+see the same samples. Several processes share the rollouts, and all get all of them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import predict
 
 
@@ -75,31 +76,34 @@ class Pool:
             s, first = tensors[f"pool.{r}.place"].tolist()
             self.rollouts.append((s, first, tensors[f"pool.{r}.displacement"].numpy()))
 
-    def refresh(self, simulator, sequences: list, config: PushforwardConfig, rng: np.random.Generator) -> float:
+    def refresh(
+        self, simulator, sequences: list, config: PushforwardConfig, rng: np.random.Generator, group: Group
+    ) -> float:
         """Fills the pool anew.
 
         Args:
             simulator: A `Simulator` around the network as it is now.
             sequences: `SequenceData`, with their `source` sequences.
             config: Settings.
-            rng: Chooses the places.
+            rng: Chooses the places, the same in all processes.
+            group: The processes that share the work.
 
         Returns:
             Mean vertex error after the last step [m], over the rollouts that stayed finite; NaN if none did.
         """
-        history = simulator.network.config.history
-        rollouts, errors = [], []
-        for _ in range(config.rollouts):
-            s = int(rng.integers(len(sequences)))
+        places = self._places(sequences, config, rng, simulator.network.config.history)
+        found = []
+        for number, (s, newest, steps, cold) in enumerate(places):
             data = sequences[s]
-            cold = rng.random() < config.cold or data.count <= history
-            newest = 0 if cold else int(rng.integers(history - 1, data.count))
-            steps = min(config.steps, data.count - 1 - newest)  # the frame after the last one is a target
-            if steps < 1:
-                continue
-            recorded = data.vertices[newest + 1 : newest + 1 + steps].cpu().numpy()
-            predicted = predict(simulator, data.source, newest, steps, cold=cold, body=data.body)
-            displacement = (predicted - recorded).astype(np.float32)
+            displacement = np.zeros((steps, *data.vertices.shape[1:]), np.float32)
+            if number % group.size == group.rank:
+                recorded = data.vertices[newest + 1 : newest + 1 + steps].cpu().numpy()
+                predicted = predict(simulator, data.source, newest, steps, cold=cold, body=data.body)
+                displacement = (predicted - recorded).astype(np.float32)
+            found.append(displacement)
+        rollouts, errors = [], []
+        for number, ((s, newest, steps, _), displacement) in enumerate(zip(places, found, strict=True)):
+            group.broadcast(torch.from_numpy(displacement), number % group.size)
             error = np.linalg.norm(displacement, axis=-1).mean(axis=1)
             good = np.isfinite(error) & (error < config.limit)
             keep = steps if good.all() else int(np.argmin(good))
@@ -109,3 +113,19 @@ class Pool:
         self.rollouts = rollouts
         finite = [e for e in errors if np.isfinite(e)]
         return float(np.mean(finite)) if finite else float("nan")
+
+    @staticmethod
+    def _places(
+        sequences: list, config: PushforwardConfig, rng: np.random.Generator, history: int
+    ) -> list[tuple[int, int, int, bool]]:
+        """Where rollouts start: sequence, newest recorded frame, steps, and whether from that frame alone."""
+        places = []
+        for _ in range(config.rollouts):
+            s = int(rng.integers(len(sequences)))
+            data = sequences[s]
+            cold = bool(rng.random() < config.cold) or data.count <= history
+            newest = 0 if cold else int(rng.integers(history - 1, data.count))
+            steps = min(config.steps, data.count - 1 - newest)  # the frame after the last one is a target
+            if steps >= 1:
+                places.append((s, newest, steps, cold))
+        return places

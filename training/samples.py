@@ -11,34 +11,31 @@ too:
 so the answer leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces
 and frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but
 components.
+
+Every sample has a stream of random numbers of its own, so that a part of a batch is the same part whoever builds it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from warpgarment.body import BodyMotion
-from warpgarment.heading import rotation_about_up, yaw
+from warpgarment.heading import rotation_about_up
 from warpgarment.kernels.deformation import (
     deformation_gradient_from_inverse,
-    inverse_rest_frames,
     relative_deformation_gradient,
     singular_values,
 )
 from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
-from warpgarment.kernels.laplacian import components
 from warpgarment.parametrisation import NetworkOutput, Step, context, targets
-from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached, unpack
-from warpgarment.training.noise import NoiseBasis, NoiseConfig
+from warpgarment.training.augmentation import Augmentation, mirror
+from warpgarment.training.interactions import COLUMNS, unpack
+from warpgarment.training.noise import NoiseConfig
+from warpgarment.training.sequence_data import SequenceData
 
-MIRROR = torch.tensor([-1.0, 1.0, 1.0])
-MIRROR_MATRIX = torch.outer(MIRROR, MIRROR).flatten()
+__all__ = ["Augmentation", "Batch", "SampleBuilder", "SequenceData", "mirror"]
 
 
 class Batch(NamedTuple):
@@ -49,111 +46,9 @@ class Batch(NamedTuple):
     velocities: torch.Tensor  # [B,C,(H-1)*3]
     weights: torch.Tensor  # [B,N,N] geodesic
     velocity_mask: torch.Tensor | None  # [B,C] bool; None where all garments have C components
+    components: torch.Tensor  # scalar: garment components of the whole batch, times the share of it that this is
     target: NetworkOutput  # what the network should say
     ids: list[tuple[str, int]]  # sequence, newest frame
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """Symmetries of the problem. `mirror`: share of samples mirrored in x; `yaw`: standard deviation [degrees] of a
-    joint turn of world and rest pose; `world_yaw`: turn the world by any angle (for networks with heading
-    "world")."""
-
-    mirror: float = 0.5
-    yaw: float = 5.0
-    world_yaw: bool = False
-
-
-class SequenceData:
-    """One sequence, ready to be sampled: tensors on the device, small things precomputed.
-
-    Args:
-        sequence: A loaded `dataset.Sequence`.
-        folder: Where it lies.
-        cache: Cache root of `interactions`.
-        network: The `NetworkConfig` samples are made for.
-        device: Where samples are built.
-    """
-
-    def __init__(self, sequence, folder: Path, cache: Path, network, device: torch.device) -> None:
-        garment = sequence.garment
-        self.name, self.device, self.source = Path(folder).name, device, sequence
-        recorded = np.asarray(sequence.vertices, np.float32)
-        if len(recorded) < network.history + 1:
-            raise UnusableSequence(f"{len(recorded)} frames, fewer than history + 1 = {network.history + 1}")
-        if not np.isfinite(recorded).all():
-            frame = int(np.nonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0][0])
-            raise UnusableSequence(f"garment positions are not finite from frame {frame}")
-        interaction, geodesics = cached(sequence, folder, cache, device)
-        if len(interaction) + 1 < network.history + 1:
-            raise UnusableSequence(f"the body has only {len(interaction) + 1} frames")
-        recorded = recorded[: len(interaction) + 1]
-        self.vertices = torch.as_tensor(recorded if recorded.flags.writeable else recorded.copy(), device=device)
-        self.interaction = torch.from_numpy(_writable(interaction)).to(device)
-        self.faces = torch.as_tensor(np.array(garment.faces, np.int32), device=device)
-        self.rest = torch.as_tensor(np.array(garment.vertices, np.float32), device=device)
-        self.inverse_rest = inverse_rest_frames(self.rest, self.faces)
-        self._geodesics, self._network, self._kernel = geodesics, network, None
-
-        vertex_component, self.components = _components(len(self.rest), garment.faces)
-        self.face_component = torch.as_tensor(vertex_component[garment.faces[:, 0]], dtype=torch.int64, device=device)
-        self.component_weights = _mean_weights(garment.faces, vertex_component, self.components).to(device)  # [C,V]
-        share = np.bincount(np.asarray(garment.faces).ravel(), minlength=len(self.rest)) / (3.0 * len(garment.faces))
-        self.garment_weights = torch.as_tensor(share, dtype=torch.float32, device=device)  # [V]
-        self.noise = NoiseBasis(np.asarray(garment.faces), vertex_component, np.asarray(garment.pins))
-
-        velocity = self.interaction[..., COLUMNS["velocity"]]
-        hot = torch.nn.functional.one_hot(self.face_component, self.components).to(velocity.dtype)
-        hot = hot / hot.sum(dim=0).clamp(min=1.0)
-        self.body_velocity = torch.einsum("fc,tfk->tck", hot, velocity)  # [T-1,C,3], over all faces
-        self.yaw = self._yaw()  # [T-1]
-
-    @cached_property
-    def body(self) -> BodyMotion:
-        """The collider, for rollouts."""
-        return self.source.body()
-
-    @property
-    def count(self) -> int:
-        """Number of samples: newest frames 0..T-2."""
-        return len(self.vertices) - 1
-
-    def _yaw(self) -> torch.Tensor:
-        angles = []
-        for vertices in self.vertices[:-1]:
-            phi = deformation_gradient_from_inverse(self.inverse_rest, vertices.contiguous(), self.faces)
-            angles.append(yaw(phi[None]))
-        return torch.cat(angles)
-
-    @property
-    def kernel(self) -> torch.Tensor:
-        """exp(-(D/r)^p), float16 [F,F]: geodesic weights of any subset of faces are its rows, divided by their sums."""
-        if self._kernel is None:
-            distances = torch.from_numpy(np.array(self._geodesics))
-            kernel = torch.exp(-((distances / self._network.geodesic_radius) ** self._network.geodesic_power))
-            self._kernel = kernel.to(device=self.device, dtype=torch.float16)
-        return self._kernel
-
-
-def _writable(array: np.ndarray) -> np.ndarray:
-    """The same memory map, copy-on-write, so that torch takes it without a warning; nothing is read yet."""
-    if isinstance(array, np.memmap):
-        return np.load(array.filename, mmap_mode="c")
-    return array
-
-
-def _components(vertex_count: int, faces: np.ndarray) -> tuple[np.ndarray, int]:
-    vertex_component, _, count = components(vertex_count, np.asarray(faces))
-    return np.asarray(vertex_component), int(count)
-
-
-def _mean_weights(faces: np.ndarray, vertex_component: np.ndarray, count: int) -> torch.Tensor:
-    """[C,V] weights whose product with vertices is the mean face centroid of each component."""
-    weights = np.zeros((count, len(vertex_component)))
-    corners = np.asarray(faces).ravel()
-    np.add.at(weights, (vertex_component[corners], corners), 1.0)
-    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
-    return torch.as_tensor(weights, dtype=torch.float32)
 
 
 class SampleBuilder:
@@ -163,7 +58,7 @@ class SampleBuilder:
         sequences: Training sequences.
         network: Their `NetworkConfig`.
         noise: Perturbation of histories.
-        augmentation: Mirror and turns.
+        augmentation: Mirror, turns and sizes.
     """
 
     def __init__(self, sequences: list[SequenceData], network, noise: NoiseConfig, augmentation: Augmentation) -> None:
@@ -178,32 +73,26 @@ class SampleBuilder:
         faces: int,
         rng: np.random.Generator,
         displacements: list[np.ndarray | None] | None = None,
+        part: slice = slice(None),
     ) -> Batch:
-        """Builds one batch.
+        """Builds one batch, or a part of it.
 
         Args:
             picks: Sequence index and newest frame of each sample.
             faces: Number N of faces per sample; every garment has as many.
-            rng: All randomness comes from here.
+            rng: All randomness comes from here: sample b draws from the b-th stream it spawns.
             displacements: Per sample None or [K,V,3] metres, K <= history: an override of the newest K frames, relative
                 to the recorded positions; noise comes on top.
+            part: The samples to build.
 
         Returns:
             The batch, on the sequences' device.
         """
-        history, device, count = self.network.history, self.device, len(picks)
-        canonical = self.network.heading == "canonical"
-        components = max(self.sequences[s].components for s, _ in picks)
-        angles = np.zeros((count, 2), np.float32)  # of the world, of world and rest together
-        angles[:, 1] = rng.standard_normal(count) * np.radians(self.augmentation.yaw)
-        if self.augmentation.world_yaw and not canonical:
-            angles[:, 0] = rng.uniform(-np.pi, np.pi, count)
-        mirrored = rng.random(count) < self.augmentation.mirror
-        world = torch.as_tensor(angles[:, 0]).to(device)
-        if canonical:
-            world = -torch.stack([self.sequences[s].yaw[t] for s, t in picks])
-        joint = rotation_about_up(torch.as_tensor(angles[:, 1]).to(device))
-        turn = joint @ rotation_about_up(world)  # [B,3,3]
+        streams, whole = rng.spawn(len(picks))[part], [self.sequences[s].components for s, _ in picks]
+        picks, real = picks[part], whole[part]
+        displacements = displacements[part] if displacements else [None] * len(picks)
+        history, device, count, components = self.network.history, self.device, len(picks), max(real)
+        turn, similarity, joint, mirrored, scale = self._drawn(picks, streams)
 
         positions, following, corners, next_corners, means = [], [], [], [], []
         rows = torch.empty(count, faces, history, 16, device=device)
@@ -215,31 +104,32 @@ class SampleBuilder:
         origin = torch.empty(count, 1, 3, device=device)
         start, next_start = 0, 0
         for b, (s, t) in enumerate(picks):
-            sequence = self.sequences[s]
+            sequence, rng = self.sequences[s], streams[b]
             subset = np.sort(rng.permutation(len(sequence.faces))[:faces])
-            subset = torch.from_numpy(subset).to(device)
-            raw = torch.arange(t - history + 1, t + 1)
-            frames = raw.clamp(min=0).to(device)
+            subset = self._send(subset)
+            frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
             past = sequence.vertices[frames]
-            delta = self._displacement(sequence, rng, displacements[b] if displacements else None)
+            delta = self._displacement(sequence, rng, displacements[b])
             if delta is not None:
                 first = max(history - 1 - t, 0)  # frames before the first repeat it, displaced as it is
-                past = past + torch.from_numpy(delta[np.maximum(np.arange(history), first)]).to(device)
+                past = past + self._send(delta[np.maximum(np.arange(history), first)])
             mean = sequence.garment_weights @ past[-1]
             origin[b] = mean
-            past = (past - mean) @ turn[b].mT
-            after = (sequence.vertices[t + 1] - mean) @ turn[b].mT
+            past = (past - mean) @ similarity[b].mT
+            after = (sequence.vertices[t + 1] - mean) @ similarity[b].mT
             centres = torch.einsum("cv,hvk->hck", sequence.component_weights, past)
             velocities[b, : sequence.components] = (centres[1:] - centres[:-1]).transpose(0, 1).flatten(1)
             velocity[b, : sequence.components] = sequence.component_weights @ after - centres[-1]
-            body_velocity[b, : sequence.components] = sequence.body_velocity[t] @ turn[b].mT
+            body_velocity[b, : sequence.components] = sequence.body_velocity[t] @ similarity[b].mT
             rows[b] = sequence.interaction[frames[None, :], subset[:, None]]
-            early = int((raw < 0).sum())
+            early = max(history - 1 - t, 0)
             if early:
                 rows[b, :, :early, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
                 rows[b, :, :early, COLUMNS["velocity"]] = 0.0
             inverse_rest[b] = sequence.inverse_rest[subset]
             kernel = sequence.kernel[subset[:, None], subset[None, :]].float()
+            if scale[b] != 1.0:  # exp(-(s D/r)^p) = exp(-(D/r)^p)^(s^p)
+                kernel = kernel ** float(scale[b] ** self.network.geodesic_power)
             torch.div(kernel, kernel.sum(dim=1, keepdim=True), out=weights[b])
             chosen, vertices = sequence.faces[subset], past.shape[1]
             steps = torch.arange(history, dtype=torch.int32, device=device) * vertices + start
@@ -252,7 +142,9 @@ class SampleBuilder:
 
         if self.augmentation.yaw:
             inverse_rest = inverse_rest @ joint[:, None].mT
-        self._turn(rows, turn, origin)
+        if self.augmentation.scale:  # edges are longer, normals are not
+            inverse_rest[:, :, :2] /= self._send(scale)[:, None, None, None]
+        self._turn(rows, turn, similarity, origin)
         stacked = inverse_rest[:, :, None].expand(-1, -1, history, -1, -1).reshape(-1, 3, 3)
         garment = torch.arange(count * history, dtype=torch.int32, device=device).reshape(count, 1, history)
         features = face_features(
@@ -272,11 +164,43 @@ class SampleBuilder:
         newest = context(features, face_component, 1)._replace(body_velocity=body_velocity)
         target = targets(step, newest, residual=self.network.residual)
         if mirrored.any():
-            features, velocities, target = mirror(features, velocities, target, torch.from_numpy(mirrored).to(device))
-        real = torch.tensor([self.sequences[s].components for s, _ in picks], device=device)
-        mask = torch.arange(components, device=device)[None] < real[:, None]
+            features, velocities, target = mirror(features, velocities, target, self._send(mirrored))
+        mask = None
+        if min(real) < components:
+            mask = self._send(np.arange(components)[None] < np.array(real)[:, None])
+        share = torch.full((), sum(whole) * count / len(whole), device=device)
         ids = [(self.sequences[s].name, t) for s, t in picks]
-        return Batch(features, velocities, weights, None if mask.all() else mask, target, ids)
+        return Batch(features, velocities, weights, mask, share, target, ids)
+
+    def _drawn(
+        self, picks: list[tuple[int, int]], streams: list[np.random.Generator]
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, np.ndarray, np.ndarray]:
+        """Per sample: turn of the world [B,3,3], the same times its scale, the part of the turn that the rest pose
+        shares, whether it is mirrored [B], and its scale [B]."""
+        settings, count = self.augmentation, len(picks)
+        canonical = self.network.heading == "canonical"
+        angles = np.zeros((2, count), np.float32)  # of the world, of world and rest together
+        mirrored, scale = np.zeros(count, bool), np.ones(count, np.float32)
+        for b, rng in enumerate(streams):
+            angles[1, b] = rng.standard_normal() * np.radians(settings.yaw)
+            angles[0, b] = rng.uniform(-np.pi, np.pi)
+            mirrored[b] = rng.random() < settings.mirror
+            scale[b] = 1.0 + settings.scale * rng.uniform(-1.0, 1.0)
+        world, both = self._send(angles)
+        if canonical:
+            world = -torch.stack([self.sequences[s].yaw[t] for s, t in picks])
+        elif not settings.world_yaw:
+            world = torch.zeros_like(world)
+        joint = rotation_about_up(both)
+        turn = joint @ rotation_about_up(world)
+        return turn, turn * self._send(scale)[:, None, None], joint, mirrored, scale
+
+    def _send(self, array: np.ndarray) -> torch.Tensor:
+        """A copy on the device; from pinned memory, so that nothing waits for it."""
+        values = torch.from_numpy(np.ascontiguousarray(array))
+        if self.device.type != "cuda":
+            return values.to(self.device)
+        return values.pin_memory().to(self.device, non_blocking=True)
 
     def _displacement(
         self, sequence: SequenceData, rng: np.random.Generator, override: np.ndarray | None
@@ -290,45 +214,12 @@ class SampleBuilder:
         return delta
 
     @staticmethod
-    def _turn(rows: torch.Tensor, turn: torch.Tensor, origin: torch.Tensor) -> None:
-        """Turns interactions [B,N,H,16] in place, about each garment's origin."""
-        back = turn.mT
+    def _turn(rows: torch.Tensor, turn: torch.Tensor, similarity: torch.Tensor, origin: torch.Tensor) -> None:
+        """Turns (and scales) interactions [B,N,H,16] in place, about each garment's origin."""
+        back = similarity.mT
         flat = rows.flatten(1, 2)
         flat[..., COLUMNS["closest"]] = (flat[..., COLUMNS["closest"]] - origin) @ back
         flat[..., COLUMNS["velocity"]] = flat[..., COLUMNS["velocity"]] @ back
         # (G D G^T) row-major is (G kron G) applied to D row-major
         both = torch.einsum("bij,bkl->bikjl", turn, turn).reshape(-1, 9, 9)
         flat[..., COLUMNS["deformation"]] = flat[..., COLUMNS["deformation"]] @ both.mT
-
-
-def mirror(
-    features: torch.Tensor, velocities: torch.Tensor, target: NetworkOutput, chosen: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, NetworkOutput]:
-    """Samples as a mirror in x shows them: v -> M v, maps A -> M A M, M = diag(-1, 1, 1); distances stay.
-
-    The mirrored garment's faces run the other way round, so that its normals point outward; they are M n.
-
-    Args:
-        features: [B,N,H*34].
-        velocities: [B,C,K*3].
-        target: [B,N,3,3], [B,N,3], [B,C,3].
-        chosen: Which samples, bool [B].
-    """
-    sign = torch.ones(FEATURES)
-    for name in ("deformation_gradient", "body_deformation"):
-        sign[LAYOUT[name]] = MIRROR_MATRIX
-    for name in ("normal", "centroid", "direction_to_body", "body_velocity"):
-        sign[LAYOUT[name]] = MIRROR
-
-    def signs(values: torch.Tensor, width: int) -> torch.Tensor:
-        values = values.to(features.device).repeat(width // len(values))
-        return torch.where(chosen[:, None], values, torch.ones_like(values))[:, None]
-
-    psi = target.psi.flatten(-2)
-    return (
-        features * signs(sign, features.shape[-1]),
-        velocities * signs(MIRROR, velocities.shape[-1]),
-        target._replace(
-            psi=(psi * signs(MIRROR_MATRIX, 9)).unflatten(-1, (3, 3)), velocity=target.velocity * signs(MIRROR, 3)
-        ),
-    )

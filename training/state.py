@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from warpgarment.errors import CheckpointError
+from warpgarment.io.atomic import atomic_file
 
 
 class Average:
@@ -48,16 +48,16 @@ def save(
     extra: dict[str, torch.Tensor],
     progress: dict[str, Any],
 ) -> None:
-    """Writes the state beside the path and renames it, so that a run can always go on from a whole file."""
+    """Writes the state beside the path, flushes it and renames it: a run can always go on from a whole file."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average.{k}": v for k, v in average.network.state_dict().items()}
     for index, values in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{k}": torch.as_tensor(v) for k, v in values.items()}
     tensors |= extra
     tensors = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-    temporary = path.with_name(f".{path.name}.partial")
-    save_file(tensors, temporary, metadata={"progress": json.dumps(progress | {"average_updates": average.updates})})
-    os.replace(temporary, path)
+    metadata = {"progress": json.dumps(progress | {"average_updates": average.updates})}
+    with atomic_file(path) as temporary:
+        save_file(tensors, temporary, metadata=metadata)
 
 
 def load(

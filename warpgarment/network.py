@@ -205,14 +205,18 @@ class ManifoldAwareTransformer(nn.Module):
             x = torch.where(face_mask[..., None], x, 0.0)  # whatever padding holds, NaN too, must not spread
             v = torch.where(velocity_mask[..., None], v, 0.0)
             key_mask = torch.cat([face_mask, velocity_mask], dim=1)[:, None, None, :]
-        faces = x.shape[1]
-        tokens = torch.cat([self.embed_faces(x), self.embed_velocity(v)], dim=1)
-        weights = geodesic_weights.to(tokens.dtype)  # once, instead of in every layer where autocast runs in half
+        faces, kind = x.shape[1], x.device.type
+        half = torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False):  # velocities are differences of frames that bfloat16 would round away
+            tokens = torch.cat([self.embed_faces(x), self.embed_velocity(v)], dim=1)
+        # once, instead of in every layer where autocast runs in half
+        weights = geodesic_weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
         for layer in self.layers:
             tokens = layer(tokens, weights, key_mask)
-        tokens = self.final_norm(tokens)
-        psi, singular_values = self.face_head(tokens[:, :faces]).split([9, 3], dim=-1)
-        return NormalisedOutput(psi, singular_values, self.velocity_head(tokens[:, faces:]))
+        with torch.autocast(kind, enabled=False):
+            tokens = self.final_norm(tokens.to(self.face_head.weight.dtype))
+            psi, singular_values = self.face_head(tokens[:, :faces]).split([9, 3], dim=-1)
+            return NormalisedOutput(psi, singular_values, self.velocity_head(tokens[:, faces:]))
 
     def denormalise(self, normalised: NormalisedOutput) -> NetworkOutput:
         """Normalised output to physical units (still in the canonical frame), in the precision of the statistics."""

@@ -1,0 +1,146 @@
+r"""Several processes that train one network, started by torchrun, on one machine or many.
+
+Each process has a device of its own, takes its share of every batch, and holds the same weights. What they have to
+agree on goes through a `Group`. One process alone is a group of one, whose calls cost nothing.
+
+    export TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1        # else torchrun's restarts meet old addresses (torch 2.13)
+    torchrun --standalone --nproc-per-node 8 --max-restarts 3 -m warpgarment train --data DATA --out OUT \
+        --steps 200000 --resume
+
+Small decisions (how late it is) travel between the processors by gloo, so that no process waits for its GPU to learn
+of them; gradients travel between GPUs by NCCL.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from datetime import timedelta
+
+import torch
+import torch.distributed as dist
+
+PATIENCE = timedelta(hours=2)  # others wait while the first process validates
+FRESH = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
+
+
+class GroupError(RuntimeError):
+    """The processes of a run cannot work together; the message says why."""
+
+
+class Group:
+    """The processes of a run.
+
+    Args:
+        device: "cpu", "cuda" or "cuda:1"; None: a GPU where there is one. Of several processes on a machine with GPUs,
+            each takes the one with its own local number.
+
+    Attributes:
+        rank, size: This process's number, and how many there are. Number 0 writes files, logs and validates.
+        device: Where it trains.
+
+    Raises:
+        GroupError: More processes than GPUs, or a device that all would share.
+    """
+
+    def __init__(self, device: str | None = None) -> None:
+        self.rank, self.size = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        if self.size > 1:
+            self._join()
+
+    def _join(self) -> None:
+        local = int(os.environ.get("LOCAL_RANK", 0))
+        if self.device.type == "cuda":
+            if self.device.index is not None:
+                raise GroupError(f"{self.size} processes cannot share {self.device}. Say --device cuda, or nothing.")
+            if local >= torch.cuda.device_count():
+                raise GroupError(
+                    f"process {local} of this machine has no GPU, there are {torch.cuda.device_count()}. Start as many "
+                    "processes as there are GPUs (torchrun --nproc-per-node), or train with --device cpu."
+                )
+            self.device = torch.device("cuda", local)
+            torch.cuda.set_device(self.device)
+        backend = "cpu:gloo,cuda:nccl" if self.device.type == "cuda" else "gloo"
+        try:
+            dist.init_process_group(backend, timeout=PATIENCE)
+        except RuntimeError as error:
+            if os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") == "0":
+                raise
+            raise GroupError(
+                f"after a restart, process {self.rank} cannot reach the others ({error}). Start torchrun with "
+                f"{FRESH}=1 in the environment: without it, it hands out addresses of processes that are gone."
+            ) from error
+
+    def __enter__(self) -> Group:
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        """Leaves the group; after an error it is left as it is, since others may still wait in it for ever."""
+        if self.size > 1 and kind is None:
+            dist.barrier()
+            dist.destroy_process_group()
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that writes."""
+        return self.rank == 0
+
+    def part(self, batch_size: int) -> slice:
+        """Which samples of a batch are this process's.
+
+        Raises:
+            GroupError: They cannot be shared evenly.
+        """
+        if batch_size % self.size:
+            raise GroupError(
+                f"{self.size} processes cannot share batches of {batch_size} samples evenly. Choose a batch size that "
+                f"is a multiple of {self.size}, such as {-(-batch_size // self.size) * self.size}."
+            )
+        count = batch_size // self.size
+        return slice(self.rank * count, (self.rank + 1) * count)
+
+    def broadcast(self, tensor: torch.Tensor, source: int = 0) -> torch.Tensor:
+        """The tensor of one process, in place in all."""
+        if self.size > 1:
+            dist.broadcast(tensor, source)
+        return tensor
+
+    def same(self, tensors: Iterable[torch.Tensor]) -> None:
+        """Replaces tensors by those of the first process."""
+        for tensor in tensors:
+            self.broadcast(tensor.detach())
+
+    def mean(self, tensor: torch.Tensor) -> torch.Tensor:
+        """Mean over the processes; the tensor itself is used up."""
+        if self.size > 1:
+            dist.all_reduce(tensor)
+            tensor /= self.size
+        return tensor
+
+    def told(self, value: float) -> float:
+        """What the first process says, for all."""
+        return value if self.size == 1 else float(self.broadcast(torch.tensor([value], dtype=torch.float64)))
+
+    def agree(self, what: str, value: int, remedy: str) -> None:
+        """Makes sure that a number is the same in all processes.
+
+        Raises:
+            GroupError: It is not; raised in all of them.
+        """
+        if self.size == 1:
+            return
+        mine = torch.tensor([value], dtype=torch.int64)
+        found = [torch.empty_like(mine) for _ in range(self.size)]
+        dist.all_gather(found, mine)
+        values = [int(v) for v in found]
+        if len(set(values)) > 1:
+            other = next(r for r, v in enumerate(values) if v != values[0])
+            raise GroupError(
+                f"{what} differs between processes 0 ({values[0]}) and {other} ({values[other]}). {remedy}"
+            )
+
+    def wait(self) -> None:
+        """Waits until all processes are here."""
+        if self.size > 1:
+            dist.barrier()

@@ -1,0 +1,71 @@
+"""Arithmetic of a training step, and what a device could do at best.
+
+Counted are the matrix products that the method needs, two operations for each multiplication with its addition, in the
+custom of "model FLOPs": nothing for layer norms, activations and softmax, and nothing twice where an implementation
+computes something again in the backward pass. For a sample of N faces and C components, T = N + C tokens, H frames of
+history, width E, feed-forward width W, L layers, of whose h heads m use geodesic weights (M = m E / h, their width):
+
+    embedding        2 N (34 H) E + 2 C 3 (H - 1) E
+    layer:
+      q, k, v        2 T E (3 E - 2 M)          queries and keys of manifold heads are not computed
+      q k^T, A v     4 T^2 (E - M)
+      geodesic A v   2 N^2 M
+      output         2 T E^2
+      feed-forward   4 T E W
+    heads            2 N E 12 + 2 C E 3
+
+The backward pass is two products for each of the forward pass, one for each factor's gradient, but one only where a
+factor needs no gradient: the embeddings' inputs and the geodesic weights.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from warpgarment.config import NetworkConfig
+from warpgarment.kernels.features import FEATURES
+
+PEAKS = (  # part of the device's name, dense bfloat16 with float32 sums [FLOP/s]; the makers' data sheets
+    ("B200", 2250e12),
+    ("H200 NVL", 835e12),
+    ("H200", 989e12),
+    ("H100 NVL", 835e12),
+    ("H100 PCIe", 756e12),
+    ("H100", 989e12),
+    ("A100", 312e12),
+    ("L40S", 362e12),
+    ("L4", 121e12),
+    ("RTX 4090", 165e12),
+    ("RTX 3090", 71e12),
+)
+
+
+def forward_flops(config: NetworkConfig, faces: int, components: int) -> tuple[int, int]:
+    """Operations of one sample's forward pass: those both of whose factors need a gradient, and the others."""
+    e, tokens = config.embedding, faces + components
+    manifold = config.manifold_heads * (e // config.heads)
+    embedding = 2 * e * (faces * config.history * FEATURES + components * 3 * (config.history - 1))
+    layer = 2 * tokens * e * (3 * e - 2 * manifold) + 4 * tokens**2 * (e - manifold)
+    layer += 2 * tokens * e * e + 4 * tokens * e * config.feed_forward
+    heads = 2 * e * (12 * faces + 3 * components)
+    return config.layers * layer + heads, embedding + config.layers * 2 * faces**2 * manifold
+
+
+def step_flops(config: NetworkConfig, samples: int, faces: int, components: int) -> int:
+    """Operations of a training step, forward and backward, see above."""
+    both, one = forward_flops(config, faces, components)
+    return samples * (3 * both + 2 * one)
+
+
+def matrix_peak(device: torch.device, precision: str) -> float | None:
+    """Most operations per second that a device can do in bfloat16; None where that is not known, or in float32."""
+    if device.type != "cuda" or precision != "bfloat16":
+        return None
+    return peak_of(torch.cuda.get_device_name(device))
+
+
+def peak_of(name: str) -> float | None:
+    """The same by the device's name; None for a slice of a device (MIG)."""
+    words = f" {name} ".replace("-", " ")
+    found = (peak for part, peak in PEAKS if f" {part} " in words)
+    return None if "MIG" in name else next(found, None)

@@ -1,0 +1,81 @@
+"""The log of a training run: `log.jsonl`, a line for people, and TensorBoard events where that is installed."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from warpgarment.io.atomic import atomic_file
+
+
+class RunLog:
+    """Writes entries of (step, seconds, values).
+
+    Args:
+        out: The run's folder; None: nothing is written.
+        resumed: Step that the run goes on from; entries after it, of a run that was killed, are dropped. None: a new
+            run, whose log starts empty.
+    """
+
+    def __init__(self, out: Path | None, resumed: int | None = None) -> None:
+        self.path = None if out is None else out / "log.jsonl"
+        self.writer = None
+        if self.path is None:
+            return
+        kept = [] if resumed is None else [line for line in _lines(self.path) if _step(line) <= resumed]
+        with atomic_file(self.path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in kept), "utf-8")
+        self.writer = _tensorboard(self.path.parent, resumed)
+
+    def write(self, step: int, seconds: float, values: dict[str, Any], *, aloud: bool = False) -> None:
+        """Adds an entry; `aloud` also prints it."""
+        if self.path is None:
+            return
+        entry = {"step": step, "seconds": round(seconds, 1), **values}
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({k: json_number(v) for k, v in entry.items()}) + "\n")
+        if aloud:
+            say("  ".join(f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in entry.items()))
+        if self.writer:
+            for name, value in values.items():
+                if isinstance(value, float):
+                    self.writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Nothing more will be written."""
+        if self.writer:
+            self.writer.close()
+
+
+def say(text: str) -> None:
+    """Prints a line above the progress bar."""
+    tqdm.write(text)
+
+
+def json_number(value: Any) -> Any:
+    """JSON knows neither infinity nor NaN: their names instead."""
+    return value if not isinstance(value, float) or math.isfinite(value) else str(value)
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text("utf-8", errors="replace").splitlines() if path.exists() else []
+
+
+def _step(line: str) -> float:
+    """Of an entry; infinity for what is none, such as half a line."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError):
+        return math.inf
+
+
+def _tensorboard(out: Path, resumed: int | None):
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(out / "events"), purge_step=None if resumed is None else resumed + 1)

@@ -1,0 +1,108 @@
+"""One sequence, ready to be sampled: everything that does not change from sample to sample, on the device."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgarment.body import BodyMotion
+from warpgarment.heading import yaw
+from warpgarment.kernels.deformation import deformation_gradient_from_inverse, inverse_rest_frames
+from warpgarment.kernels.laplacian import components
+from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached
+from warpgarment.training.noise import NoiseBasis
+
+
+class SequenceData:
+    """One sequence, ready to be sampled: tensors on the device, small things precomputed.
+
+    Args:
+        sequence: A loaded `dataset.Sequence`.
+        folder: Where it lies.
+        cache: Cache root of `interactions`.
+        network: The `NetworkConfig` samples are made for.
+        device: Where samples are built.
+    """
+
+    def __init__(self, sequence, folder: Path, cache: Path, network, device: torch.device) -> None:
+        garment = sequence.garment
+        self.name, self.device, self.source = Path(folder).name, device, sequence
+        recorded = np.asarray(sequence.vertices, np.float32)
+        if len(recorded) < network.history + 1:
+            raise UnusableSequence(f"{len(recorded)} frames, fewer than history + 1 = {network.history + 1}")
+        if not np.isfinite(recorded).all():
+            frame = int(np.nonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0][0])
+            raise UnusableSequence(f"garment positions are not finite from frame {frame}")
+        interaction, geodesics = cached(sequence, folder, cache, device)
+        if len(interaction) + 1 < network.history + 1:
+            raise UnusableSequence(f"the body has only {len(interaction) + 1} frames")
+        recorded = recorded[: len(interaction) + 1]
+        self.vertices = torch.as_tensor(recorded if recorded.flags.writeable else recorded.copy(), device=device)
+        self.interaction = torch.from_numpy(_writable(interaction)).to(device)
+        self.faces = torch.as_tensor(np.array(garment.faces, np.int32), device=device)
+        self.rest = torch.as_tensor(np.array(garment.vertices, np.float32), device=device)
+        self.inverse_rest = inverse_rest_frames(self.rest, self.faces)
+        self._geodesics, self._network, self._kernel = geodesics, network, None
+
+        vertex_component, self.components = _components(len(self.rest), garment.faces)
+        self.face_component = torch.as_tensor(vertex_component[garment.faces[:, 0]], dtype=torch.int64, device=device)
+        self.component_weights = _mean_weights(garment.faces, vertex_component, self.components).to(device)  # [C,V]
+        share = np.bincount(np.asarray(garment.faces).ravel(), minlength=len(self.rest)) / (3.0 * len(garment.faces))
+        self.garment_weights = torch.as_tensor(share, dtype=torch.float32, device=device)  # [V]
+        self.noise = NoiseBasis(np.asarray(garment.faces), vertex_component, np.asarray(garment.pins))
+
+        velocity = self.interaction[..., COLUMNS["velocity"]]
+        hot = torch.nn.functional.one_hot(self.face_component, self.components).to(velocity.dtype)
+        hot = hot / hot.sum(dim=0).clamp(min=1.0)
+        self.body_velocity = torch.einsum("fc,tfk->tck", hot, velocity)  # [T-1,C,3], over all faces
+        self.yaw = self._yaw()  # [T-1]
+
+    @cached_property
+    def body(self) -> BodyMotion:
+        """The collider, for rollouts."""
+        return self.source.body()
+
+    @property
+    def count(self) -> int:
+        """Number of samples: newest frames 0..T-2."""
+        return len(self.vertices) - 1
+
+    def _yaw(self) -> torch.Tensor:
+        angles = []
+        for vertices in self.vertices[:-1]:
+            phi = deformation_gradient_from_inverse(self.inverse_rest, vertices.contiguous(), self.faces)
+            angles.append(yaw(phi[None]))
+        return torch.cat(angles)
+
+    @property
+    def kernel(self) -> torch.Tensor:
+        """exp(-(D/r)^p), float16 [F,F]: geodesic weights of any subset of faces are its rows, divided by their sums."""
+        if self._kernel is None:
+            distances = torch.from_numpy(np.array(self._geodesics))
+            kernel = torch.exp(-((distances / self._network.geodesic_radius) ** self._network.geodesic_power))
+            self._kernel = kernel.to(device=self.device, dtype=torch.float16)
+        return self._kernel
+
+
+def _writable(array: np.ndarray) -> np.ndarray:
+    """The same memory map, copy-on-write, so that torch takes it without a warning; nothing is read yet."""
+    if isinstance(array, np.memmap):
+        return np.load(array.filename, mmap_mode="c")
+    return array
+
+
+def _components(vertex_count: int, faces: np.ndarray) -> tuple[np.ndarray, int]:
+    vertex_component, _, count = components(vertex_count, np.asarray(faces))
+    return np.asarray(vertex_component), int(count)
+
+
+def _mean_weights(faces: np.ndarray, vertex_component: np.ndarray, count: int) -> torch.Tensor:
+    """[C,V] weights whose product with vertices is the mean face centroid of each component."""
+    weights = np.zeros((count, len(vertex_component)))
+    corners = np.asarray(faces).ravel()
+    np.add.at(weights, (vertex_component[corners], corners), 1.0)
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
+    return torch.as_tensor(weights, dtype=torch.float32)
