@@ -18,7 +18,7 @@ from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 from warpgarment.training import evaluate
 from warpgarment.training.baselines import kabsch, rigid, skinned
 from warpgarment.training.dataset import Sequence
-from warpgarment.training.evaluate import EvaluateConfig, NoTestData
+from warpgarment.training.evaluate import EvaluateConfig, NoTestData, OptionMissing
 
 
 def moving_body(frames: int, move) -> tuple[BodyMotion, Garment]:
@@ -127,3 +127,13 @@ def test_nothing_to_evaluate_is_said(evaluated, tmp_path):
     synthetic_sequences.write(tmp_path / "data", "brief", "test", frames=5)
     with pytest.raises(NoTestData, match="5 frames"):
         evaluate.evaluate(EvaluateConfig(data=tmp_path / "data", out=tmp_path / "out", network=config.network))
+
+
+def test_missing_folders_are_named(tmp_path):
+    """Options that only tables can do without would end in a traceback."""
+    for config, option in (
+        (EvaluateConfig(out=tmp_path, picture=False), "--data"),
+        (EvaluateConfig(data=tmp_path, picture=False), "--out"),
+    ):
+        with pytest.raises(OptionMissing, match=option):
+            evaluate.evaluate(config)

@@ -1,46 +1,36 @@
 """Evaluation: a network's rollouts on the test sequences of a data folder, beside two baselines.
 
     warpgarment evaluate --data sequences --network out/run/best.safetensors --out out/evaluation
+    warpgarment evaluate --table table1 --data sequences --steps 20000      # one of the paper's tables, see `tables`
 
 Every sequence is rolled out autoregressively twice: **warm**, from its first ten recorded frames, and **cold**, from
 the first alone. Only predicted frames count. Baselines start from the newest frame that the network saw. Pins are
 tied to the body's surface where they were in the first frame the method saw, as in any simulation; nothing recorded
 is used after the start.
 
-Writes `evaluation.json`, `evaluation.md` and `error_over_time.png`, each complete or not at all.
+Writes `evaluation.json`, `evaluation.md` and `error_over_time.png`, each complete or not at all. The tables measure in
+the same way, with `measure`.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
+import tyro
 
-from warpgarment import checkpoint, metrics
-from warpgarment.body import BodyMotion
+from warpgarment import checkpoint
 from warpgarment.errors import MissingExtra
 from warpgarment.simulator import Simulator
-from warpgarment.training.baselines import rigid, skinned
-from warpgarment.training.dataset import Sequence, list_sequences
-from warpgarment.training.rollouts import predict
-
-METHODS = ("network", "skinned", "rigid")
-STARTS = ("warm", "cold")
-FIGURES = {  # key -> heading, format
-    "mean_vertex_error_cm": ("error [cm]", "{:.2f}"),
-    "chamfer_m2": ("chamfer [m²]", "{:.2e}"),
-    "geodesic_distortion_m": ("geodesic distortion [m]", "{:.2e}"),
-    "body_collision": ("inside body [%]", "{:.2%}"),
-    "max_penetration_m": ("deepest [mm]", "{:.1f}"),
-}
+from warpgarment.training.dataset import list_sequences
+from warpgarment.training.tables.errors import OptionMissing
+from warpgarment.training.tables.options import TableName, TableOptions
+from warpgarment.training.tables.protocol import FIGURES, METHODS, STARTS, cells, evenly, means, measure, plain
 
 
 class NoTestData(ValueError):
@@ -53,8 +43,9 @@ class EvaluateConfig:
 
     Attributes:
         data: Folder of sequences.
-        out: Folder for the results.
-        network: Checkpoint file or folder, or the name of a network that ships.
+        out: Folder for the results; those of tables go to benchmarks/results by default.
+        network: Checkpoint file or folder, or the name of a network that ships. table1 and table2 train networks of
+            their own: small or base, the shape to start from ("default" is small).
         split: Which sequences.
         frames: Most frames predicted per sequence; None: all there are.
         geodesic_frames: Frames per rollout at which geodesic distortion is sampled, evenly spaced.
@@ -63,10 +54,12 @@ class EvaluateConfig:
         device: "cpu", "cuda"; None: a GPU where there is one.
         threads: CPU threads of torch; None leaves torch's own choice.
         picture: Draw the error over time (needs matplotlib: extra `train`).
+        table: Make one of the paper's tables or figures, or `long`, rollouts of 1,000 frames.
+        tables: Options of the tables.
     """
 
-    data: Path
-    out: Path
+    data: Path | None = None
+    out: Path | None = None
     network: str = "default"
     split: str = "test"
     frames: int | None = None
@@ -76,16 +69,20 @@ class EvaluateConfig:
     device: str | None = None
     threads: int | None = None
     picture: bool = True
+    table: TableName | None = None
+    tables: tyro.conf.OmitArgPrefixes[TableOptions] = field(default_factory=TableOptions)
 
 
 def evaluate(config: EvaluateConfig) -> dict[str, Any]:
-    """Evaluates a network.
+    """Evaluates a network, or makes a table.
 
     Returns:
         `settings`, `network` (file, config, notes), `sequences` (per sequence and start: figures of each method),
-        `mean` (start -> method -> figures), `skipped` (name -> reason), `frames_predicted`, `seconds_per_frame`.
+        `mean` (start -> method -> figures), `skipped` (name -> reason), `frames_predicted`, `seconds_per_frame`; for
+        tables what `tables.make_table` returns.
 
     Raises:
+        OptionMissing: No data or no out folder.
         NoTestData: Nothing to evaluate.
         CheckpointError: No such network.
         MissingExtra: A picture is wanted and matplotlib is missing.
@@ -96,99 +93,44 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         torch.set_num_threads(config.threads)
     if config.picture:
         _pyplot()
-    path = checkpoint.find(config.network)
+    if config.table is not None:
+        from warpgarment.training.tables import make_table
+
+        return make_table(config)
+    for name in ("data", "out"):
+        if getattr(config, name) is None:
+            raise OptionMissing(f"an evaluation needs --{name} FOLDER")
+    path = checkpoint.find(config.network, device=config.device)
     simulator = Simulator(checkpoint.load(path), config.device)
-    history = simulator.network.config.history
-    folders = _chosen(list_sequences(Path(config.data), split=config.split), config.max_sequences)
-    rows: list[dict[str, Any]] = []
-    curves: dict[tuple[str, str], list[np.ndarray]] = {}
-    skipped: dict[str, str] = {}
-    spent, predicted_frames = 0.0, 0
-    for folder in tqdm(folders, desc="evaluating", unit="sequence"):
-        try:
-            sequence = Sequence.load(folder)
-            body = sequence.body()
-            last = min(len(sequence.vertices), body.frames) - 1
-            if last < history:
-                raise ValueError(f"{last + 1} frames, fewer than history + 1 = {history + 1}")
-            if not np.isfinite(np.asarray(sequence.vertices)).all():
-                raise ValueError("recorded garment positions are not finite")
-        except (ValueError, OSError, KeyError, IndexError) as error:
-            skipped[Path(folder).name] = f"{type(error).__name__}: {error}"
-            continue
-        for start in STARTS:
-            newest = history - 1 if start == "warm" else 0
-            steps = min(last - newest, config.frames or last)
-            truth = np.array(sequence.vertices[newest + 1 : newest + steps + 1], np.float32)
-            after = np.asarray(body.vertices[newest + 1 : newest + steps + 1])
-            row = {"sequence": Path(folder).name, "start": start, "frames": steps}
-            row |= {key: sequence.manifest.get(key, "") for key in ("category", "motion", "body")}
-            for method, run in _methods(simulator, sequence, body, newest, steps, start, config.baselines).items():
-                began = time.perf_counter()
-                vertices = run()
-                if method == "network":
-                    spent, predicted_frames = spent + time.perf_counter() - began, predicted_frames + steps
-                faces = sequence.garment.faces
-                row[method] = figures(vertices, truth, faces, after, body.faces, config.geodesic_frames)
-                error = 100.0 * np.linalg.norm(vertices.astype(np.float64) - truth, axis=-1).mean(axis=1)
-                curves.setdefault((method, start), []).append(error)
-            rows.append(row)
-    if not rows:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+    folders = evenly(list_sequences(Path(config.data), split=config.split), config.max_sequences)
+    found = measure(
+        simulator,
+        folders,
+        frames=config.frames,
+        geodesic_frames=config.geodesic_frames,
+        baselines=config.baselines,
+    )
+    if not found.rows:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(found.skipped.items())[:3])
         raise NoTestData(f"{config.data}: no {config.split} sequence to evaluate ({reasons or 'none found'})")
+    settings = {k: v for k, v in vars(config).items() if k not in ("table", "tables")}
     result = {
-        "settings": {k: v.name if isinstance(v, Path) else v for k, v in vars(config).items()},  # results travel
+        "settings": {k: v.name if isinstance(v, Path) else v for k, v in settings.items()},  # results travel
         "network": _describe(path, simulator),
-        "frames_predicted": predicted_frames,
-        "seconds_per_frame": spent / max(predicted_frames, 1),
-        "mean": means(rows),
-        "sequences": rows,
-        "skipped": skipped,
+        "frames_predicted": found.frames,
+        "seconds_per_frame": found.seconds / max(found.frames, 1),
+        "mean": means(found.rows),
+        "sequences": found.rows,
+        "skipped": found.skipped,
     }
-    write(Path(config.out), result, curves, picture=config.picture)
-    return result
-
-
-def figures(
-    vertices: np.ndarray,
-    truth: np.ndarray,
-    faces: np.ndarray,
-    body_vertices: np.ndarray,
-    body_faces: np.ndarray,
-    geodesic_frames: int,
-) -> dict[str, float]:
-    """All figures of one rollout, [T,V,3] against [T,V,3] on a body [T,U,3]; inf or NaN where it failed."""
-    finite = bool(np.isfinite(vertices).all())
-    sampled = np.unique(np.linspace(0, len(vertices) - 1, max(geodesic_frames, 1)).round().astype(int))
-    return {
-        "mean_vertex_error_cm": float(metrics.mean_vertex_error(vertices, truth)) if finite else math.inf,
-        "chamfer_m2": float(metrics.chamfer_distance(vertices[sampled], truth[sampled])),
-        "geodesic_distortion_m": float(metrics.geodesic_distortion(vertices[sampled], truth[sampled], faces)),
-        "body_collision": float(metrics.body_collision(vertices, body_vertices, body_faces)),
-        "max_penetration_m": float(metrics.max_penetration(vertices, body_vertices, body_faces)),
-        "finite": finite,
-    }
-
-
-def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Means over sequences, start -> method -> figure (penetration: the deepest), over those that stayed finite."""
-    result: dict[str, dict[str, dict[str, float]]] = {}
-    for start in STARTS:
-        for method in METHODS:
-            found = [row[method] for row in rows if row["start"] == start and method in row]
-            if not found:
-                continue
-            good = [f for f in found if f["finite"]]
-            mean = {key: float(np.mean([f[key] for f in good])) if good else math.nan for key in FIGURES}
-            mean["max_penetration_m"] = max((f["max_penetration_m"] for f in good), default=math.nan)
-            result.setdefault(start, {})[method] = mean | {"failed": len(found) - len(good), "sequences": len(found)}
+    write(Path(config.out), result, found.curves, picture=config.picture)
     return result
 
 
 def write(out: Path, result: dict[str, Any], curves: dict[tuple[str, str], list[np.ndarray]], *, picture: bool) -> None:
     """Writes the result files, each under another name first."""
     out.mkdir(parents=True, exist_ok=True)
-    _replace(out / "evaluation.json", lambda path: path.write_text(json.dumps(_plain(result), indent=1), "utf-8"))
+    _replace(out / "evaluation.json", lambda path: path.write_text(json.dumps(plain(result), indent=1), "utf-8"))
     _replace(out / "evaluation.md", lambda path: path.write_text(table(result), "utf-8"))
     if picture:
         _replace(out / "error_over_time.png", lambda path: draw(path, curves))
@@ -209,12 +151,12 @@ def table(result: dict[str, Any]) -> str:
     headings = [heading for heading, _ in FIGURES.values()]
     lines += _row(["start", "method", *headings, "failed"]), _row(["---"] * (len(headings) + 3))
     for start, methods in result["mean"].items():
-        lines += [_row([start, method, *_cells(f), str(f["failed"])]) for method, f in methods.items()]
+        lines += [_row([start, method, *cells(f), str(f["failed"])]) for method, f in methods.items()]
     lines += ["", _row(["sequence", "start", "frames", "method", *headings]), _row(["---"] * (len(headings) + 4))]
     for row in result["sequences"]:
         for method in METHODS:
             if method in row:
-                lines.append(_row([row["sequence"], row["start"], str(row["frames"]), method, *_cells(row[method])]))
+                lines.append(_row([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])]))
     lines += ["", *(f"Skipped {name}: {reason}" for name, reason in result["skipped"].items())]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -243,48 +185,13 @@ def draw(path: Path, curves: dict[tuple[str, str], list[np.ndarray]]) -> None:
     pyplot.close(figure)
 
 
-def _methods(
-    simulator: Simulator, sequence: Sequence, body: BodyMotion, newest: int, steps: int, start: str, baselines: bool
-) -> dict[str, Callable[[], np.ndarray]]:
-    """What to roll out: each gives vertices of frames newest+1 .. newest+steps."""
-    methods = {"network": lambda: predict(simulator, sequence, newest, steps, cold=start == "cold", body=body)}
-    if baselines:
-        first = np.array(sequence.vertices[newest], np.float32)
-        part = BodyMotion(body.vertices[newest : newest + steps + 1], body.faces, body.fps)
-        methods["skinned"] = lambda: skinned(sequence.garment, first, part)[1:]
-        methods["rigid"] = lambda: rigid(sequence.garment, first, part)[1:]
-    return methods
-
-
-def _chosen(folders: list[Path], most: int | None) -> list[Path]:
-    if most is None or len(folders) <= most:
-        return folders
-    return [folders[(i * len(folders)) // most] for i in range(most)]
-
-
 def _describe(path: Path, simulator: Simulator) -> dict[str, Any]:
     _, notes = checkpoint.read_metadata(path)
     return {"file": path.name, "config": vars(simulator.network.config), "notes": notes}
 
 
-def _cells(values: dict[str, float]) -> list[str]:
-    scale = {"max_penetration_m": 1000.0}
-    return [form.format(values[key] * scale.get(key, 1.0)) for key, (_, form) in FIGURES.items()]
-
-
 def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
-
-
-def _plain(value: Any) -> Any:
-    """JSON knows neither infinity nor NaN: null."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _replace(path: Path, make: Callable[[Path], Any]) -> None:

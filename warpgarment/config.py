@@ -23,6 +23,7 @@ class NetworkConfig:
     geodesic_power: float = 20.0
     geodesic_radius: float = 1.0  # metres
     residual: bool = False  # see parametrisation.py
+    replace_singular_values: bool = True  # of Psi Phi by the predicted ones (section 4.3.1); an ablation leaves them
     heading: str = "world"  # or "canonical", see heading.py
     norm_first: bool = False
     activation: str = "relu"  # or "gelu"

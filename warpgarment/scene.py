@@ -174,8 +174,10 @@ class Scene:
             finite = self.all_of(sound, packed.garment_of_face)
             kept = finite[packed.garment_of_face.long()]  # NaN of one garment must not reach a solver
             psi = torch.where(kept[:, None, None], step.psi, torch.eye(3).to(phi))
-            stretch = torch.where(kept[:, None], step.singular_values, 1.0).clamp(min=SMALLEST_SINGULAR_VALUE)
-            target = replace_singular_values((psi @ phi).contiguous(), stretch)
+            target = (psi @ phi).contiguous()
+            if self.network.config.replace_singular_values:
+                stretch = torch.where(kept[:, None], step.singular_values, 1.0).clamp(min=SMALLEST_SINGULAR_VALUE)
+                target = replace_singular_values(target, stretch)
         with self.timings("poisson"):
             velocity = torch.nan_to_num(step.velocity, 0.0, 0.0, 0.0)
             mean = self.components_mean(vertices) + velocity

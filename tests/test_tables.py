@@ -1,0 +1,496 @@
+"""The paper's tables: one protocol and one budget for all rows, no recording in a rollout, distances as geometry has
+them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import meshes
+import numpy as np
+import pytest
+import synthetic_sequences
+import torch
+import trimesh
+
+from warpgarment import checkpoint, cli
+from warpgarment.garment import Garment
+from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.simulator import Simulator
+from warpgarment.training import train
+from warpgarment.training.dataset import Sequence, list_sequences
+from warpgarment.training.evaluate import EvaluateConfig, evaluate
+from warpgarment.training.rollouts import predict
+from warpgarment.training.tables import compare, figure7, meshing, protocol, report, runs, settings, variants
+from warpgarment.training.tables.errors import DataLacks, OptionMissing
+from warpgarment.training.tables.options import TableOptions
+from warpgarment.training.train import TrainConfig
+
+SHAPE = ("dropout=0.0", "embedding=16", "layers=1", "feed_forward=16", "heads=2", "manifold_heads=1")
+QUICK = (
+    "batch_size=2", "validate_frames=4", "validate_sequences=1", "statistics_batches=2", "ahead=0",
+    "pushforward.share=0.0", "save_every=2", "validate_every=2", "log_every=1",
+)  # fmt: skip
+NETWORK = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return synthetic_sequences.write_set(tmp_path_factory.mktemp("set") / "sequences", train=2, frames=16, pins=4)
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory) -> Path:
+    """An untrained network whose output is not just skin, so that what it sees shows in what it says."""
+    torch.manual_seed(0)
+    module = ManifoldAwareTransformer(NETWORK)
+    for head in (module.face_head, module.velocity_head):
+        torch.nn.init.normal_(head.weight, std=1e-3)
+    path = tmp_path_factory.mktemp("network") / "random.safetensors"
+    checkpoint.save(module, path)
+    return path
+
+
+def table_config(data: Path, root: Path, table: str = "table2", **options) -> EvaluateConfig:
+    base = {"runs": root / "runs", "steps": 3, "overrides": SHAPE, "settings": QUICK}
+    if table == "table2":
+        base["rows"] = ("power_1", "radius_0.3")
+    tables = TableOptions(**(base | options))
+    return EvaluateConfig(
+        data=data, out=root / "out", table=table, tables=tables, device="cpu", frames=4, geodesic_frames=1
+    )
+
+
+@pytest.fixture(scope="module")
+def made(data, tmp_path_factory):
+    """Two rows of table 2, trained for three steps each."""
+    root = tmp_path_factory.mktemp("table2")
+    config = table_config(data, root)
+    return root, config, evaluate(config)
+
+
+def test_rows_of_table_2_have_one_budget_and_their_own_attention(made):
+    """Rows differ in more than the row is about: every setting but power and radius must be equal in their records, and
+    both must have had their three steps."""
+    root, _, result = made
+    records = {n: json.loads((root / "runs/table2" / n / "row.json").read_text()) for n in ("power_1", "radius_0.3")}
+    one, other = (record["settings"] for record in records.values())
+    differing = {key for key in one if one[key] != other[key]}
+    assert differing == {"network.geodesic_power", "network.geodesic_radius"}
+    assert all(record["complete"] and record["steps"] == 3 for record in records.values())
+    shapes = [checkpoint.read_metadata(root / "runs/table2" / n / "network.safetensors")[0] for n in records]
+    assert [(s.geodesic_power, s.geodesic_radius) for s in shapes] == [(1.0, 0.15), (2.0, 0.3)]
+    assert [row["steps"] for row in result["rows"] if row["row"] != "baselines"] == [3, 3]
+
+
+def test_rows_are_measured_alike_and_written(made, data):
+    """A row is measured otherwise than `evaluate` would, or a file is missing: the first row against an independent
+    evaluation of its checkpoint (to 1e-9: the same computation)."""
+    root, config, result = made
+    file = root / "runs/table2/power_1" / json.loads((root / "runs/table2/power_1/row.json").read_text())["file"]
+    alone = dataclasses.replace(config, table=None, out=root / "alone", network=str(file), picture=False)
+    again = evaluate(alone)
+    for start in ("warm", "cold"):
+        ours = result["rows"][0]["mean"][start]["network"]
+        assert ours["mean_vertex_error_cm"] == pytest.approx(
+            again["mean"][start]["network"]["mean_vertex_error_cm"], rel=1e-9
+        )
+        baseline = result["rows"][-1]["mean"][start]["skinned"]
+        assert baseline["chamfer_m2"] == pytest.approx(again["mean"][start]["skinned"]["chamfer_m2"], rel=1e-9)
+    assert sorted(p.name for p in config.out.iterdir()) == ["table2.json", "table2.md", "table2.png"]
+    saved = json.loads((config.out / "table2.json").read_text())
+    assert [row["row"] for row in saved["rows"]] == ["power_1", "radius_0.3", "baselines"]
+    text = (config.out / "table2.md").read_text()
+    assert "--table table2" in text
+    assert "p = 1, r = 0.15 m" in text
+    assert "3 steps" in text
+    assert str(root) not in text
+    assert (config.out / "table2.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_complete_runs_are_not_trained_again(made, data, monkeypatch):
+    """A table that is made again would cost its trainings again."""
+    _, config, _ = made
+    monkeypatch.setattr(runs, "train", lambda config: pytest.fail(f"trained {config.out} again"))
+    again = evaluate(dataclasses.replace(config, picture=False, baselines=False))
+    assert [row["row"] for row in again["rows"]] == ["power_1", "radius_0.3"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps": 4}, "steps was 3, is 4"),
+        ({"seed": 1}, "seed was 0, is 1"),
+        ({"settings": (*QUICK, "lr=0.5")}, "lr was 0.001, is 0.5"),
+        ({"overrides": (*SHAPE, "layers=2")}, "network.layers was 1, is 2"),
+    ],
+)
+def test_runs_with_other_settings_are_refused(made, monkeypatch, change, message):
+    """A row with another budget, seed, training or shape would stand in the table as if it were comparable."""
+    _, config, _ = made
+    monkeypatch.setattr(runs, "train", lambda config: pytest.fail("trained over another run"))
+    with pytest.raises(runs.RunMismatch, match=message):
+        evaluate(dataclasses.replace(config, tables=dataclasses.replace(config.tables, **change)))
+
+
+def test_other_data_and_foreign_folders_are_refused(made, data, tmp_path, monkeypatch):
+    """Rows trained on different data, by hand, or whose network was exchanged, would stand side by side."""
+    root, config, _ = made
+    monkeypatch.setattr(runs, "train", lambda config: pytest.fail("trained over another run"))
+    other = synthetic_sequences.write_set(tmp_path / "other", train=1, frames=14)
+    with pytest.raises(runs.RunMismatch, match="data train was 2, is 1"):
+        evaluate(dataclasses.replace(config, data=other))
+    training = compare.plan(config)[0]["power_1"]
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "best.safetensors").write_bytes(b"")
+    with pytest.raises(runs.RunMismatch, match="did not start it"):
+        runs.trained(tmp_path / "foreign", training, runs.identity(data))
+    folder = root / "runs/table2/power_1"
+    record = json.loads((folder / "row.json").read_text())
+    (tmp_path / "changed").mkdir()
+    (tmp_path / "changed" / "row.json").write_text(json.dumps(record))
+    theirs = root / "runs/table2/radius_0.3/network.safetensors"
+    (tmp_path / "changed" / record["file"]).write_bytes(theirs.read_bytes())
+    with pytest.raises(runs.RunMismatch, match="another than"):
+        runs.trained(tmp_path / "changed", training, runs.identity(data))
+
+
+def test_an_interrupted_row_goes_on_to_the_same_network(made, data, tmp_path, monkeypatch):
+    """A resumed row starts anew, or ends as another network than one trained in one go: weights must be equal, bit for
+    bit, to those of the fixture, which was not interrupted."""
+    root, config, _ = made
+    training = compare.plan(config)[0]["power_1"]
+    folder = tmp_path / "row"
+
+    with monkeypatch.context() as patch:  # stops in the third step, after the state of the second was saved
+        update = train.Run.update
+
+        def stopping(self, batch):
+            if self.step == 2:
+                raise KeyboardInterrupt
+            return update(self, batch)
+
+        patch.setattr(train.Run, "update", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            runs.trained(folder, training, runs.identity(data))
+    assert json.loads((folder / "row.json").read_text())["complete"] is False
+    assert (folder / "state.safetensors").exists()
+    run = runs.trained(folder, training, runs.identity(data))
+    assert run.steps == 3
+    ours, theirs = (
+        checkpoint.load(f / "network.safetensors").state_dict() for f in (folder, root / "runs/table2/power_1")
+    )
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
+def test_rows_of_table_1_change_what_they_say():
+    """A row leaves in what it claims to leave out: heads, loss term and the replacement of singular values."""
+    common = TrainConfig(data=Path("d"), out=Path("o"), steps=1)
+    rows = {row.name: row for row in variants.table1()}
+    assert list(rows) == ["without_manifold_heads", "without_singular_values", "full"]
+    bare = rows["without_manifold_heads"].of(common)
+    assert (bare.network_config().manifold_heads, common.network_config().manifold_heads) == (0, 2)
+    counts = [ManifoldAwareTransformer(c.network_config()).parameter_count() for c in (bare, common)]
+    assert counts[0] == counts[1]
+    no_values = rows["without_singular_values"].of(common)
+    assert no_values.loss.singular_values == 0.0
+    assert no_values.network_config() == dataclasses.replace(common.network_config(), replace_singular_values=False)
+    assert rows["full"].of(common) == common
+
+
+def test_without_singular_values_predicted_ones_change_nothing(data):
+    """The row of table 1 still uses predicted singular values: a network whose prediction of them is off by a half must
+    give the rollout of one whose is not, bit for bit; with them, faces come out half as large again."""
+    sequence = Sequence.load(list_sequences(data, split="test")[0])
+    moved = {}
+    for replaced in (False, True):
+        shape = dataclasses.replace(NETWORK, replace_singular_values=replaced)
+        for off in (0.0, 0.5):
+            torch.manual_seed(0)
+            network = ManifoldAwareTransformer(shape)
+            network.singular_value_mean += off
+            simulator = Simulator(network, "cpu", collision_passes=0)
+            moved[replaced, off] = predict(simulator, sequence, 0, 3, cold=True)
+    np.testing.assert_array_equal(moved[False, 0.0], moved[False, 0.5])
+    sizes = [np.ptp(moved[True, off][-1], axis=0).max() for off in (0.0, 0.5)]
+    assert sizes[1] > 1.2 * sizes[0]  # not quite half: pins hold part of it
+
+
+def test_rows_of_table_2_cover_the_papers_powers():
+    """A power of the paper's table 2 is missing, or the network as given stands there twice."""
+    rows = variants.table2(NetworkConfig.base())
+    powers = [dict(row.value)["power"] for row in rows if "power" in dict(row.value)]
+    assert powers == [0.01, 0.1, 1, 10, 20, 50, 100]
+    assert [row.name for row in rows].count("as_given") == 1
+    assert {dict(row.value).get("radius") for row in rows} >= {0.05, 0.15, 0.3, 0.6, 1.0}
+    small = variants.table2(NetworkConfig.small())
+    assert {dict(row.value).get("power") for row in small} >= {*powers, 2.0}
+
+
+def test_plans_that_cannot_be_are_refused(data, tmp_path):
+    """Hours of training on a table with no budget, two budgets, equal rows or misspelt settings."""
+    for change, message in (
+        ({"steps": None}, "--steps N or --time-limit"),
+        ({"time_limit": 1.0}, "--steps N or --time-limit"),
+    ):
+        with pytest.raises(OptionMissing, match=message):
+            compare.plan(table_config(data, tmp_path, **change))
+    with pytest.raises(OptionMissing, match="small or base"):
+        compare.plan(dataclasses.replace(table_config(data, tmp_path), network="elsewhere.safetensors"))
+    with pytest.raises(variants.RowError, match="no rows power_7"):
+        compare.plan(table_config(data, tmp_path, rows=("power_7",)))
+    headless = table_config(data, tmp_path, "table1", rows=("full", "without_manifold_heads"))
+    tables = dataclasses.replace(headless.tables, overrides=(*SHAPE, "manifold_heads=0"))
+    with pytest.raises(variants.RowError, match="without_manifold_heads and full would be the same"):
+        compare.plan(dataclasses.replace(headless, tables=tables))
+    with pytest.raises(variants.RowError, match="no network setting 'laiers'"):
+        compare.plan(table_config(data, tmp_path, overrides=("laiers=2",)))
+    for text, message in (
+        ("lrr=1", "no setting 'lrr'"),
+        ("lr=fast", "must be float"),
+        ("noise=1", "a group"),
+        ("steps=9", "an option of its own"),
+        ("batch_size", "name=value"),
+        ("loss.velocity=true", "must be float"),
+    ):
+        with pytest.raises(settings.SettingError, match=message):
+            compare.plan(table_config(data, tmp_path, settings=(text,)))
+    changed = settings.with_settings(TrainConfig(data=data, out=tmp_path, steps=1), ("noise.position=0.5", "lr=1"))
+    assert (changed.noise.position, changed.lr) == (0.5, 1)
+
+
+def spoiled(sequence: Sequence, known: int) -> Sequence:
+    """The same sequence with other garment positions after the known frames."""
+    other = Sequence.load(sequence.folder)
+    vertices = np.array(sequence.vertices)
+    vertices[known:] = vertices[known:][::-1] + np.float32(0.05)
+    other.__dict__["vertices"] = vertices
+    return other
+
+
+class Spoiling:
+    """Stands in for `Sequence` where only `load` is asked for."""
+
+    def __init__(self, known: int) -> None:
+        self.known = known
+
+    def load(self, folder: Path) -> Sequence:
+        return spoiled(Sequence.load(folder), self.known)
+
+
+@pytest.mark.parametrize(("start", "known"), [("warm", 10), ("cold", 1)])
+def test_recorded_frames_after_the_start_do_not_reach_a_rollout(data, network, monkeypatch, start, known):
+    """Ground truth leaks into the figures: other recorded frames after the tenth (or first) must give the same
+    predictions, bit for bit, in the shared protocol and in figure 7."""
+    simulator = Simulator(checkpoint.load(network), "cpu")
+    folder = list_sequences(data, split="test")[0]
+    config = EvaluateConfig(data=data, frames=4, tables=TableOptions(faces=(90,)))
+    seen: list[list[np.ndarray]] = []
+    errors: list[float] = []
+    for change in (False, True):
+        found: list[np.ndarray] = []
+
+        def observe(sequence, body, begun, newest, vertices, found=found):
+            if begun == start:
+                found.append(vertices)
+
+        with monkeypatch.context() as patch:
+            if change:
+                patch.setattr(protocol, "Sequence", Spoiling(known))
+            measured = protocol.measure(simulator, [folder], frames=4, baselines=False, observe=observe)
+        sequence = spoiled(Sequence.load(folder), known) if change else Sequence.load(folder)
+        surfaces = figure7.resolutions(simulator, sequence, sequence.body(), config, start)
+        found += [surface.vertices for surface in surfaces.values()]
+        seen.append(found)
+        row = next(row for row in measured.rows if row["start"] == start)
+        errors.append(row["network"]["mean_vertex_error_cm"])
+    assert len(seen[0]) == 3
+    for plain, changed in zip(*seen, strict=True):
+        assert np.isfinite(plain).all()
+        np.testing.assert_array_equal(plain, changed)
+    assert abs(errors[0] - errors[1]) > 1.0  # the figures did look at the changed recording
+
+
+def test_surface_distance_of_spheres():
+    """The distance of figure 7 is wrong: concentric spheres of radius 1 and 1.1 are 0.1 apart whatever their meshes,
+    and a sphere meshed otherwise is hardly apart from itself. 2 mm: how far flat faces lie inside the sphere."""
+    fine, finer = meshes.icosphere(4, radius=1.0), meshes.icosphere(5, radius=1.1)
+    assert meshing.surface_distance(*fine, *finer) == pytest.approx(0.1, abs=2e-3)
+    assert meshing.surface_distance(*finer, *fine) == pytest.approx(meshing.surface_distance(*fine, *finer), rel=1e-12)
+    assert meshing.surface_distance(*fine, *meshes.icosphere(5, radius=1.0)) < 2e-3
+    assert meshing.surface_distance(*fine, *fine) < 1e-9
+    broken = fine.vertices.copy()
+    broken[3] = np.nan
+    assert np.isnan(meshing.surface_distance(broken, fine.faces, *fine))
+
+
+def test_surface_distance_weighs_by_area():
+    """Regions with many small faces would count more: a plane of which half is meshed finely and lies 1 higher. By
+    area both halves count alike, so the directed mean of a flat plane below is 0.5 (exact but for the step's edge)."""
+    coarse, fine = _plane(0.0, 1.0, 2), _plane(1.0, 2.0, 16)
+    low = _plane(-4.0, 6.0, 4)
+    raised = (np.concatenate([coarse[0], fine[0] + [0, 1, 0]]), np.concatenate([coarse[1], fine[1] + len(coarse[0])]))
+    assert meshing._directed(*raised, *low) == pytest.approx(0.5, abs=1e-9)
+
+
+def _plane(start: float, end: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    x, z = np.meshgrid(np.linspace(start, end, cells + 1), np.linspace(-3, 3, cells + 1), indexing="ij")
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = (index[s] for s in (np.s_[:-1, :-1], np.s_[1:, :-1], np.s_[1:, 1:], np.s_[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, c, b], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
+    return np.stack([x, np.zeros_like(x), z], -1).reshape(-1, 3), faces
+
+
+def test_remeshed_garments_follow_and_keep_their_pins():
+    """A remeshed garment does not lie on the recorded one, or loses its waistband: carried at rest it lies on the old
+    mesh where the new one is (4 mm: remeshing cuts the corners of a tube of 24 sides), and what carries it is
+    barycentric, so an affine map of the old mesh is the same map of what was carried (1e-5 m: float32)."""
+    vertices, faces = synthetic_sequences.tube(24, 9, 0.2, 0.8, 1.3)
+    top = np.flatnonzero(vertices[:, 1] > 1.29)
+    garment = Garment(vertices.astype(np.float32), faces.astype(np.int32), pins=top)
+    new = meshing.remesh(garment, 900)
+    assert abs(len(new.garment.faces) - 900) < 90
+    at_rest = new.carried(garment.vertices)
+    assert np.linalg.norm(at_rest - new.garment.vertices, axis=1).max() < 4e-3
+    turn = np.array([[0.0, 0.2, 1.1], [0.1, 1.0, 0.0], [-0.9, 0.0, 0.3]])
+    np.testing.assert_allclose(new.carried(garment.vertices @ turn.T + 0.5), at_rest @ turn.T + 0.5, atol=1e-5)
+    assert len(new.garment.pins) > 12
+    assert new.garment.vertices[new.garment.pins, 1].min() > 1.26
+    beside = np.concatenate([vertices, vertices + [1.0, 0, 0]]).astype(np.float32)
+    pieces = Garment(beside, np.concatenate([faces, faces + len(vertices)]).astype(np.int32))
+    with pytest.raises(meshing.NotRemeshable, match="2 pieces"):
+        meshing.remesh(pieces, 900)
+
+
+def test_figure_7_measures_every_resolution_from_the_recorded_one(data, network, tmp_path):
+    """Resolutions are missing or compared with the wrong surface: the distance in one frame against that to all
+    triangles, one by one, by trimesh (1e-4: float32 positions)."""
+    config = EvaluateConfig(
+        data=data,
+        out=tmp_path,
+        network=str(network),
+        table="figure7",
+        frames=3,
+        device="cpu",
+        tables=TableOptions(faces=(90, 200)),
+        picture=False,
+    )
+    result = evaluate(config)
+    assert [(r["row"], r["start"]) for r in result["rows"]] == [
+        (name, start) for start in ("warm", "cold") for name in ("recorded mesh", "90 faces", "200 faces")
+    ]
+    assert result["rows"][0]["distance_m"] == 0.0
+    sequence = Sequence.load(list_sequences(data, split="test")[0])
+    simulator = Simulator(checkpoint.load(network), "cpu")
+    surfaces = figure7.resolutions(simulator, sequence, sequence.body(), config, "warm")
+    ours = next(r for r in result["sequences"] if r["row"] == "200 faces" and r["start"] == "warm")
+    a, b = surfaces["recorded mesh"], surfaces["200 faces"]
+    directed = []
+    for one, other in ((a, b), (b, a)):
+        triangles, points = other.vertices[2][other.faces].astype(np.float64), one.vertices[2].astype(np.float64)
+        pairs = np.tile(triangles, (len(points), 1, 1)), np.repeat(points, len(triangles), axis=0)
+        distance = np.linalg.norm(trimesh.triangles.closest_point(*pairs) - pairs[1], axis=1)
+        distance = distance.reshape(len(points), -1).min(axis=1)
+        area = trimesh.triangles.area(points[one.faces])
+        share = np.array([area[(one.faces == v).any(1)].sum() for v in range(len(points))])
+        directed.append((distance * share).sum() / share.sum())
+    assert ours["distance_over_time_m"][2] == pytest.approx(np.mean(directed), rel=1e-4)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["figure7.json", "figure7.md"]
+
+
+@pytest.fixture(scope="module")
+def grouped(tmp_path_factory) -> Path:
+    """A set with seam cuts, bodies and categories of which some are for tests only."""
+    root = tmp_path_factory.mktemp("groups") / "data"
+    anny, wooden = {"body": {"kind": "anny"}}, {"body": {"kind": "mannequin"}}
+
+    def cut(number):
+        return {"parameters": {"cut": number}}
+
+    for name, split, entries in (
+        ("a", "train", anny | cut(0) | {"category": "dress"}),
+        ("b", "validation", anny | cut(0) | {"category": "dress"}),
+        ("c", "test", anny | cut(10) | {"category": "dress"}),
+        ("d", "test", wooden | cut(11) | {"category": "dress"}),
+        ("e", "test", anny | cut(10) | {"category": "skirt"}),
+    ):
+        synthetic_sequences.write(root, name, split, frames=13, seed=ord(name), manifest=entries)
+    (root / "set.json").write_text(json.dumps({"configuration": {"held_out": ["skirt"]}}))
+    return root
+
+
+@pytest.mark.parametrize(
+    ("table", "groups"),
+    [
+        ("figure9", {"unseen_cuts": "cde", "training_cuts": "b", "training_sequences": "a"}),
+        ("figure12", {"seen": "ce", "seen_same_categories": "c", "mannequin": "d"}),
+        ("category", {"seen": "cd", "dress": "cd", "skirt": "e"}),
+    ],
+)
+def test_groups_hold_what_was_seen_and_what_was_not(grouped, network, tmp_path, table, groups):
+    """A sequence stands in the wrong group, so that the unseen looks as good as the seen; means are over each group's
+    own sequences (against a mean by hand, rel 1e-9)."""
+    config = EvaluateConfig(
+        data=grouped, out=tmp_path, network=str(network), table=table, frames=2, geodesic_frames=1, device="cpu",
+        baselines=False, picture=table == "category",
+    )  # fmt: skip
+    result = evaluate(config)
+    assert {r["row"]: "".join(sorted({s["sequence"] for s in r["sequences"]})) for r in result["rows"]} == groups
+    row = result["rows"][0]
+    warm = [s["network"]["mean_vertex_error_cm"] for s in row["sequences"] if s["start"] == "warm"]
+    assert row["mean"]["warm"]["network"]["mean_vertex_error_cm"] == pytest.approx(np.mean(warm), rel=1e-9)
+    if table == "category":
+        names = {"category.json", "category.md", "category.png", "category_rollouts.png"}
+        assert {p.name for p in tmp_path.iterdir()} == names
+
+
+def test_data_that_lack_a_group_are_named_with_the_command(data, grouped, network, tmp_path, capsys):
+    """A table of one row that compares nothing; the message must say what makes the missing data."""
+    for table, command in (
+        ("figure9", "--recipe seams"),
+        ("figure12", "mannequin and a creature"),
+        ("category", "--held-out"),
+    ):
+        arguments = ["evaluate", "--table", table, "--data", str(data), "--out", str(tmp_path), "--no-picture"]
+        assert cli.main([*arguments, "--network", str(network)]) == 2
+        line = capsys.readouterr().err.strip().splitlines()[-1]
+        assert line.startswith("warpgarment: DataLacks:")
+        assert "warpgarment generate" in line
+        assert command in line
+    config = EvaluateConfig(data=grouped, table="category", tables=TableOptions(held_out=("dress",)), picture=False)
+    with pytest.raises(DataLacks, match="dress is not held out, 1 training"):
+        evaluate(config)
+    with pytest.raises(OptionMissing, match="--data"):
+        evaluate(EvaluateConfig(table="figure12", picture=False))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_figure_5_times_every_stage(network, tmp_path):
+    """Stages are missing, counted twice or from other frames: they must add up to the frame's time (1e-9), which lies
+    between nothing and the time of the whole call."""
+    config = EvaluateConfig(
+        out=tmp_path, network=str(network), table="figure5", frames=3, device="cpu", tables=TableOptions(faces=(400,))
+    )
+    began = time.perf_counter()
+    (row,) = evaluate(config)["rows"]
+    spent = time.perf_counter() - began
+    assert set(row["ms"]) >= {"features", "signed distance", "network", "singular values", "poisson", "collision"}
+    assert sum(row["ms"].values()) == pytest.approx(row["frame_ms"], rel=1e-9)
+    assert min(row["ms"].values()) > 0
+    assert 1e-3 * row["frame_ms"] + row["setup_s"] < spent
+    assert abs(row["faces"] - 400) < 60
+    assert {p.suffix for p in tmp_path.iterdir()} == {".json", ".md", ".png"}
+
+
+def test_the_command_in_a_table_parses_and_names_no_folders(data, tmp_path):
+    """The command that stands in a result does not make it again, or tells where it was made."""
+    import tyro
+
+    config = table_config(data, tmp_path)
+    text = report.command(config)
+    assert str(tmp_path) not in text
+    parsed = tyro.cli(EvaluateConfig, args=text.split()[2:])
+    assert parsed.tables == dataclasses.replace(config.tables, runs=Path("runs"))
+    assert (parsed.table, parsed.frames, parsed.device) == ("table2", 4, "cpu")

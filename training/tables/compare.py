@@ -1,0 +1,114 @@
+"""Tables 1 and 2: networks that differ in one setting, trained on one budget, measured on the same sequences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from warpgarment import checkpoint
+from warpgarment.simulator import Simulator
+from warpgarment.training.dataset import list_sequences
+from warpgarment.training.train import TrainConfig
+
+from . import variants
+from .errors import DataLacks, OptionMissing
+from .pictures import bars, sweeps
+from .protocol import evenly, means, measure
+from .report import BASELINES, PROTOCOL, means_table, publish
+from .runs import identity, trained
+from .settings import with_settings
+
+TITLES = {
+    "table1": "Table 1: what manifold heads and singular values are worth",
+    "table2": "Table 2: power and radius of the geodesic attention",
+}
+PAPER = {
+    "table1": "The paper, on its own data: 4.54 cm without manifold heads, 12.2 without singular values, 3.19 in full; "
+    "geodesic distortion 2.83e-2, 9.33e-2 and 2.05e-2.",
+    "table2": "The paper, on its own data, with D in metres (r = 1 m): 4.34 cm at p = 0.01, then 3.79 (0.1), 3.23 (1), "
+    "3.31 (10), 3.19 (20), 3.20 (50), 4.72 (100).",
+}
+
+
+def make(config: Any) -> dict[str, Any]:
+    """Trains what is not trained yet, measures every row, writes the table.
+
+    Raises:
+        RunMismatch: A row's folder holds another run.
+        RowError, SettingError: Rows or settings that there are not.
+        OptionMissing, DataLacks: No budget, no data, no test sequences.
+    """
+    configs, chosen = plan(config)
+    root = Path(config.data)
+    folders = evenly(list_sequences(root, split=config.split), config.max_sequences)
+    if not folders:
+        raise DataLacks(f"{root}: no {config.split} sequences. `warpgarment generate --out DIR` makes a set with some")
+    data, rows, skipped = identity(root), [], {}
+    runs = {v.name: trained(Path(config.tables.runs) / config.table / v.name, configs[v.name], data) for v in chosen}
+    for variant in chosen:
+        run = runs[variant.name]
+        simulator = Simulator(checkpoint.load(run.file), config.device)
+        baselines = config.baselines and not rows  # they are the same for all rows
+        found = measure(
+            simulator, folders, frames=config.frames, geodesic_frames=config.geodesic_frames, baselines=baselines
+        )
+        if not found.rows:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(found.skipped.items())[:3])
+            raise DataLacks(f"{root}: no {config.split} sequence can be evaluated ({reasons})")
+        skipped |= found.skipped
+        mean = means(found.rows)
+        own = {start: {"network": methods["network"]} for start, methods in mean.items()}
+        rows.append(
+            {"row": variant.name, "label": variant.label, "mean": own, "steps": run.steps, "hours": run.hours}
+            | {"value": dict(variant.value), "overrides": variant.overrides, "settings": variant.settings}
+            | {"parameters": simulator.network.parameter_count(), "sequences": found.rows}
+        )
+        if baselines:
+            beside = {s: {m: f for m, f in methods.items() if m in BASELINES} for s, methods in mean.items()}
+    if config.baselines:
+        rows.append({"row": "baselines", "label": "", "mean": beside})
+    result = {"table": config.table, "title": TITLES[config.table], "protocol": PROTOCOL, "data": data}
+    result |= {"budget": _budget(config), "rows": rows, "skipped": skipped}
+    body = [PROTOCOL, "", f"Every row: {_budget(config)}.", ""]
+    body += [*means_table(rows, {"steps": "steps", "hours": "hours"}), "", PAPER[config.table]]
+    draw = sweeps if config.table == "table2" else bars
+    publish(config, result, body, lambda path: draw(path, rows))
+    return result
+
+
+def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
+    """The training of each row, and the rows; nothing is trained here."""
+    options = config.tables
+    if config.data is None:
+        raise OptionMissing(f"{config.table} needs --data FOLDER")
+    if (options.steps is None) == (options.time_limit is None):
+        raise OptionMissing(f"{config.table} trains networks: give their budget, --steps N or --time-limit MINUTES")
+    shape = "small" if config.network == "default" else config.network
+    if shape not in ("small", "base"):
+        raise OptionMissing(f"{config.table} trains networks of its own; --network is their shape, small or base")
+    common = TrainConfig(
+        data=Path(config.data),
+        out=Path(options.runs),
+        network=cast(Literal["small", "base"], shape),
+        overrides=options.overrides,
+        steps=options.steps,
+        time_limit=options.time_limit,
+        seed=options.seed,
+        device=config.device,
+        threads=config.threads,
+    )
+    common = with_settings(common, options.settings)
+    variants.check_different({"all": common})  # says so if an override does not exist
+    rows = variants.table1() if config.table == "table1" else variants.table2(common.network_config())
+    rows = variants.chosen(rows, options.rows)
+    configs = {variant.name: variant.of(common) for variant in rows}
+    variants.check_different(configs)
+    return configs, rows
+
+
+def _budget(config: Any) -> str:
+    options = config.tables
+    shape = "small" if config.network == "default" else config.network
+    length = f"{options.steps:,} steps" if options.steps is not None else f"{options.time_limit:g} minutes"
+    changes = " ".join((*options.overrides, *options.settings))
+    return f"network {shape} {changes}".rstrip() + f", {length}, seed {options.seed}, the same data"

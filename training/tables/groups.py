@@ -1,0 +1,191 @@
+"""Figures 9 and 12 and the unseen category: one network, test sequences in groups that were seen in training or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from warpgarment import checkpoint
+from warpgarment.simulator import Simulator
+from warpgarment.training.dataset import list_sequences, read_manifest
+from warpgarment.training.recipes import TRAINING_CUTS
+from warpgarment.training.set_manifest import read_set_manifest
+
+from .errors import DataLacks, OptionMissing
+from .pictures import Keeper, bars, results_file, rollouts
+from .protocol import evenly, means, measure
+from .report import PROTOCOL, means_table, publish
+
+
+@dataclass(frozen=True)
+class Group:
+    """Sequences that make a row.
+
+    Attributes:
+        name: Of the row.
+        label: In the table.
+        seen: Whether training has seen what the table is about.
+        folders: Its sequences.
+    """
+
+    name: str
+    label: str
+    seen: bool
+    folders: list[Path]
+
+
+Manifests = dict[Path, dict[str, Any]]
+
+
+def make(config: Any) -> dict[str, Any]:
+    """Measures the groups of a table and writes it.
+
+    Raises:
+        OptionMissing: No data.
+        DataLacks: The data set does not have both sides of the comparison.
+    """
+    if config.data is None:
+        raise OptionMissing(f"{config.table} needs --data FOLDER")
+    title, find, note = TABLES[config.table]
+    groups = find(Path(config.data), config)
+    rows, skipped, keeper = [], {}, Keeper({group.folders[0].name for group in groups})
+    for place in (config.network, *config.tables.against):
+        path = checkpoint.find(place, device=config.device)
+        simulator = Simulator(checkpoint.load(path), config.device)
+        first = not rows
+        folders = {folder: None for group in groups for folder in evenly(group.folders, config.max_sequences)}
+        found = measure(
+            simulator,
+            list(folders),
+            frames=config.frames,
+            geodesic_frames=config.geodesic_frames,
+            baselines=config.baselines and first,
+            observe=keeper if first and config.picture else None,
+        )
+        skipped |= found.skipped
+        for group in groups:
+            names = {folder.name for folder in evenly(group.folders, config.max_sequences)}
+            mine = [row for row in found.rows if row["sequence"] in names]
+            if not mine:
+                reasons = "; ".join(f"{n}: {r}" for n, r in found.skipped.items() if n in names)
+                raise DataLacks(f"{config.data}: no sequence of {group.label!r} can be evaluated ({reasons})")
+            label = group.label + (f", {_label(path)}" if config.tables.against else "")
+            rows.append(
+                {"row": group.name, "label": label, "seen": group.seen, "network": _label(path), "mean": means(mine)}
+                | {"count": len({row["sequence"] for row in mine}), "sequences": mine}
+            )
+    result = {"table": config.table, "title": title, "protocol": PROTOCOL, "rows": rows, "skipped": skipped}
+    body = [note, "", PROTOCOL, "", *means_table(rows, {"count": "sequences"})]
+    if config.picture:
+        drawn = results_file(config, f"{config.table}_rollouts.png")
+        if rollouts(drawn, keeper, [(group.label, group.folders[0].name) for group in groups]):
+            body += ["", f"![One sequence of each group]({drawn.name})"]
+    publish(config, result, body, lambda path: bars(path, rows))
+    return result
+
+
+def cuts(root: Path, config: Any) -> list[Group]:
+    """Figure 9: the cuts trained on, on training and on unseen motions, and cuts never seen."""
+    manifests = _manifests(root, None)
+    numbers = {folder: (m.get("parameters") or {}).get("cut") for folder, m in manifests.items()}
+    cut = {folder: n for folder, n in numbers.items() if n is not None}
+    trained = {n for folder, n in cut.items() if manifests[folder].get("split") == "train"}
+
+    def those(split: str, seen: bool) -> list[Path]:
+        return [f for f, n in cut.items() if manifests[f].get("split") == split and (n in trained) == seen]
+
+    groups = [
+        Group("unseen_cuts", "unseen cuts, unseen motions", False, those("test", False)),
+        Group("training_cuts", "cuts trained on, motions not trained on", True, those("validation", True)),
+        Group("training_sequences", "cuts and motions trained on", True, those("train", True)),
+    ]
+    if not groups[0].folders or not any(group.folders for group in groups[1:]):
+        raise DataLacks(
+            f"{root}: no garments with seam cuts of which some are trained on and others are not (the recipe trains "
+            f"on {TRAINING_CUTS}). `warpgarment generate --recipe seams --sequences 48 --out DIR` makes such a set"
+        )
+    return [group for group in groups if group.folders]
+
+
+def bodies(root: Path, config: Any) -> list[Group]:
+    """Figure 12: bodies of kinds that no training sequence has, and those of kinds that some have."""
+    manifests = _manifests(root, config.split)
+    trained = {_kind(m) for m in _manifests(root, "train").values()}
+    kinds = {folder: _kind(m) for folder, m in manifests.items()}
+    seen = [f for f, k in kinds.items() if k in trained]
+    unseen = [f for f, k in kinds.items() if k not in trained]
+    if not unseen or not seen:
+        lack = "has a body of a kind not trained on" if seen else "has a body of a kind that is trained on"
+        raise DataLacks(
+            f"{root}: no {config.split} sequence {lack} (there are {', '.join(sorted(set(kinds.values()))) or 'none'})."
+            " `warpgarment generate --out DIR` tests on a mannequin and a creature"
+        )
+    groups = [Group("seen", f"bodies as trained on ({', '.join(sorted(trained))})", True, seen)]
+    worn = {manifests[f].get("category") for f in unseen}
+    same = [f for f in seen if manifests[f].get("category") in worn]
+    if same and len(same) < len(seen):
+        names = ", ".join(sorted(map(str, worn)))
+        groups.append(Group("seen_same_categories", f"... in the categories below ({names})", True, same))
+    for kind in sorted({kinds[f] for f in unseen}):
+        groups.append(Group(kind, f"{kind}, never seen", False, [f for f in unseen if kinds[f] == kind]))
+    return groups
+
+
+def categories(root: Path, config: Any) -> list[Group]:
+    """The unseen category: test sequences of categories held out, and of the others one by one and together."""
+    held_out = tuple(config.tables.held_out) or _held_out(root)
+    manifests = _manifests(root, config.split)
+    kinds = {folder: str(m.get("category")) for folder, m in manifests.items()}
+    trained = [str(m.get("category")) for m in _manifests(root, "train").values()]
+    make_it = "`warpgarment generate --held-out skirt --out DIR` makes a set that tests on skirts only"
+    if not held_out:
+        raise DataLacks(f"{root}: no set.json says which categories are held out; give --held-out NAME. {make_it}")
+    for name in held_out:
+        if name in trained:
+            raise DataLacks(
+                f"{root}: {name} is not held out, {trained.count(name)} training sequences have it. {make_it}"
+            )
+    unseen = [f for f, k in kinds.items() if k in held_out]
+    seen = [f for f, k in kinds.items() if k not in held_out]
+    if not unseen or not seen:
+        lack = ", ".join(held_out) if not unseen else "another category"
+        raise DataLacks(f"{root}: no {config.split} sequence with {lack}. {make_it}")
+    groups = [Group("seen", "all categories trained on", True, seen)]
+    for kind in sorted({kinds[f] for f in seen}):
+        groups.append(Group(kind, kind, True, [f for f in seen if kinds[f] == kind]))
+    for kind in sorted({kinds[f] for f in unseen}):
+        groups.append(Group(kind, f"{kind}, never seen", False, [f for f in unseen if kinds[f] == kind]))
+    return groups
+
+
+def _manifests(root: Path, split: str | None) -> Manifests:
+    return {folder: read_manifest(folder) for folder in list_sequences(root, split=split)}
+
+
+def _kind(manifest: dict[str, Any]) -> str:
+    body = manifest.get("body")
+    return str(body.get("kind", "unknown")) if isinstance(body, dict) else str(body)
+
+
+def _held_out(root: Path) -> tuple[str, ...]:
+    found = read_set_manifest(root) or {}
+    return tuple(map(str, (found.get("configuration") or {}).get("held_out") or ()))
+
+
+def _label(path: Path) -> str:
+    """A run's folder where the file is called as all runs call theirs."""
+    return path.parent.name if path.stem in ("best", "network") else path.stem
+
+
+TABLES: dict[str, tuple[str, Callable[[Path, Any], list[Group]], str]] = {
+    "figure9": (
+        "Figure 9: seam cuts never seen",
+        cuts,
+        "Trained on: by a network trained on this set. Motions not trained on are those of validation, which choose "
+        "the best checkpoint of such a run.",
+    ),
+    "figure12": ("Figure 12: bodies never seen", bodies, "Bodies of a kind that no training sequence of the set has."),
+    "category": ("A garment category never seen", categories, "Categories that no training sequence of the set has."),
+}

@@ -1,0 +1,192 @@
+"""How everything is measured: rollouts of sequences from two starts, their figures, and the means of these.
+
+Every sequence is rolled out twice: **warm**, from the ten recorded frames that a network remembers, and **cold**, from
+the first alone. From then on it runs free; only predicted frames count. Pins are tied to the body's surface, never to
+recorded positions, and the recording is compared with as it is, without smoothing.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from warpgarment import metrics
+from warpgarment.body import BodyMotion
+from warpgarment.garment import Garment
+from warpgarment.simulator import Simulator
+from warpgarment.training.baselines import rigid, skinned
+from warpgarment.training.dataset import Sequence
+from warpgarment.training.rollouts import predict
+
+METHODS = ("network", "skinned", "rigid")
+STARTS = ("warm", "cold")
+FIGURES = {  # key -> heading, format
+    "mean_vertex_error_cm": ("error [cm]", "{:.2f}"),
+    "chamfer_m2": ("chamfer [m²]", "{:.2e}"),
+    "geodesic_distortion_m": ("geodesic distortion [m]", "{:.2e}"),
+    "body_collision": ("inside body [%]", "{:.2%}"),
+    "max_penetration_m": ("deepest [mm]", "{:.1f}"),
+}
+
+
+@dataclass
+class Measured:
+    """Rollouts of one network, measured.
+
+    Attributes:
+        rows: Per sequence and start: figures of each method.
+        curves: (method, start) -> error over time [cm], one array a sequence.
+        skipped: Sequence -> reason.
+        frames: Frames that the network predicted.
+        seconds: What it took for them.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    curves: dict[tuple[str, str], list[np.ndarray]] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    frames: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Known:
+    """What `rollouts.predict` asks of a sequence: a garment and its first frames [H,V,3], nothing after these."""
+
+    garment: Garment
+    vertices: np.ndarray
+
+
+def measure(
+    simulator: Simulator,
+    folders: list[Path],
+    *,
+    frames: int | None = None,
+    geodesic_frames: int = 5,
+    baselines: bool = True,
+    observe: Callable[[Sequence, BodyMotion, str, int, np.ndarray], None] | None = None,
+) -> Measured:
+    """Rolls sequences out from both starts and measures them.
+
+    Args:
+        simulator: Around the network.
+        folders: Sequences; what cannot be evaluated is skipped with a reason.
+        frames: Most frames predicted per sequence; None: all there are.
+        geodesic_frames: Frames per rollout at which geodesic distortion is sampled.
+        baselines: Also roll out the baselines.
+        observe: Called for every rollout of the network with the sequence, its body, the start, the newest recorded
+            frame that was seen, and the predicted vertices [T,V,3].
+    """
+    history = simulator.network.config.history
+    result = Measured()
+    for folder in tqdm(folders, desc="evaluating", unit="sequence"):
+        try:
+            sequence = Sequence.load(folder)
+            body = sequence.body()
+            last = min(len(sequence.vertices), body.frames) - 1
+            if last < history:
+                raise ValueError(f"{last + 1} frames, fewer than history + 1 = {history + 1}")
+            if not np.isfinite(np.asarray(sequence.vertices)).all():
+                raise ValueError("recorded garment positions are not finite")
+        except (ValueError, OSError, KeyError, IndexError) as error:
+            result.skipped[Path(folder).name] = f"{type(error).__name__}: {error}"
+            continue
+        for start in STARTS:
+            newest = history - 1 if start == "warm" else 0
+            steps = min(last - newest, frames or last)
+            truth = np.array(sequence.vertices[newest + 1 : newest + steps + 1], np.float32)
+            after = np.asarray(body.vertices[newest + 1 : newest + steps + 1])
+            row = {"sequence": Path(folder).name, "start": start, "frames": steps}
+            row |= {key: sequence.manifest.get(key, "") for key in ("category", "motion", "body")}
+            for method, run in _methods(simulator, sequence, body, newest, steps, start, baselines).items():
+                began = time.perf_counter()
+                vertices = run()
+                if method == "network":
+                    result.seconds += time.perf_counter() - began
+                    result.frames += steps
+                    if observe is not None:
+                        observe(sequence, body, start, newest, vertices)
+                row[method] = figures(vertices, truth, sequence.garment.faces, after, body.faces, geodesic_frames)
+                error = 100.0 * np.linalg.norm(vertices.astype(np.float64) - truth, axis=-1).mean(axis=1)
+                result.curves.setdefault((method, start), []).append(error)
+            result.rows.append(row)
+    return result
+
+
+def figures(
+    vertices: np.ndarray,
+    truth: np.ndarray,
+    faces: np.ndarray,
+    body_vertices: np.ndarray,
+    body_faces: np.ndarray,
+    geodesic_frames: int,
+) -> dict[str, float]:
+    """All figures of one rollout, [T,V,3] against [T,V,3] on a body [T,U,3]; inf or NaN where it failed."""
+    finite = bool(np.isfinite(vertices).all())
+    sampled = np.unique(np.linspace(0, len(vertices) - 1, max(geodesic_frames, 1)).round().astype(int))
+    return {
+        "mean_vertex_error_cm": float(metrics.mean_vertex_error(vertices, truth)) if finite else math.inf,
+        "chamfer_m2": float(metrics.chamfer_distance(vertices[sampled], truth[sampled])),
+        "geodesic_distortion_m": float(metrics.geodesic_distortion(vertices[sampled], truth[sampled], faces)),
+        "body_collision": float(metrics.body_collision(vertices, body_vertices, body_faces)),
+        "max_penetration_m": float(metrics.max_penetration(vertices, body_vertices, body_faces)),
+        "finite": finite,
+    }
+
+
+def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """Means over sequences, start -> method -> figure (penetration: the deepest), over those that stayed finite."""
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    for start in STARTS:
+        for method in METHODS:
+            found = [row[method] for row in rows if row["start"] == start and method in row]
+            if not found:
+                continue
+            good = [f for f in found if f["finite"]]
+            mean = {key: float(np.mean([f[key] for f in good])) if good else math.nan for key in FIGURES}
+            mean["max_penetration_m"] = max((f["max_penetration_m"] for f in good), default=math.nan)
+            result.setdefault(start, {})[method] = mean | {"failed": len(found) - len(good), "sequences": len(found)}
+    return result
+
+
+def cells(values: dict[str, float]) -> list[str]:
+    """Figures as text, in the order of `FIGURES`; depth in millimetres."""
+    scale = {"max_penetration_m": 1000.0}
+    return [form.format(values[key] * scale.get(key, 1.0)) for key, (_, form) in FIGURES.items()]
+
+
+def evenly(folders: list[Path], most: int | None) -> list[Path]:
+    """At most so many of the folders, evenly spread over the list."""
+    if most is None or len(folders) <= most:
+        return folders
+    return [folders[(i * len(folders)) // most] for i in range(most)]
+
+
+def plain(value: Any) -> Any:
+    """JSON knows neither infinity nor NaN: null."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _methods(
+    simulator: Simulator, sequence: Sequence, body: BodyMotion, newest: int, steps: int, start: str, baselines: bool
+) -> dict[str, Callable[[], np.ndarray]]:
+    """What to roll out: each gives vertices of frames newest+1 .. newest+steps."""
+    methods = {"network": lambda: predict(simulator, sequence, newest, steps, cold=start == "cold", body=body)}
+    if baselines:
+        first = np.array(sequence.vertices[newest], np.float32)
+        part = BodyMotion(body.vertices[newest : newest + steps + 1], body.faces, body.fps)
+        methods["skinned"] = lambda: skinned(sequence.garment, first, part)[1:]
+        methods["rigid"] = lambda: rigid(sequence.garment, first, part)[1:]
+    return methods

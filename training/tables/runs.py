@@ -1,0 +1,137 @@
+"""Trained rows: each in a folder of its own, trained once, with the settings that all rows of a table share.
+
+`row.json` in the folder says which settings the run has, on which data, and whether it is complete. A run that is
+complete is taken as it is; one that was interrupted goes on; one with other settings, other data or another budget is
+refused, never trained over.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from warpgarment import checkpoint
+from warpgarment.errors import CheckpointError
+from warpgarment.io.atomic import atomic_file
+from warpgarment.training.dataset import list_sequences, read_manifest
+from warpgarment.training.train import TrainConfig, train
+
+from .settings import described, differences
+
+RECORD = "row.json"
+
+
+class RunMismatch(ValueError):
+    """A folder holds a run that is not the one this row needs; says what differs."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained row.
+
+    Attributes:
+        file: The network, best in the validation rollouts.
+        steps: That its training took.
+        hours: That it took.
+    """
+
+    file: Path
+    steps: int | None
+    hours: float | None
+
+
+def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
+    """The run of a row; trains it, or goes on training it, unless it is complete.
+
+    Args:
+        folder: Of the run.
+        config: Its settings; `out` and `resume` are set here.
+        data: From `identity`.
+
+    Raises:
+        RunMismatch: The folder holds another run, or the training stopped before its budget was spent.
+    """
+    wanted = {"settings": described(config), "data": data}
+    record = _read(folder)
+    if record is None:
+        if folder.is_dir() and any(folder.iterdir()):
+            raise RunMismatch(f"{folder} holds files but no {RECORD}: this command did not start it. Give other --runs")
+        _write(folder, wanted | {"complete": False})
+    else:
+        _check_same(folder, record, wanted)
+        if record.get("complete"):
+            return _complete(folder, record, config)
+    file = train(replace(config, out=folder, resume=True))
+    if config.steps is not None:
+        done = _notes(folder / "network.safetensors").get("steps")
+        if done not in (None, config.steps):
+            raise RunMismatch(f"{folder}: training stopped after {done} of {config.steps} steps; run it again")
+    notes = _notes(folder / "network.safetensors")  # the last one: `file` may be of an earlier step
+    record = wanted | {"complete": True, "file": Path(file).name, "sha256": _checksum(Path(file))}
+    record |= {"steps": notes.get("steps"), "hours": notes.get("hours")}
+    _write(folder, record)
+    return _complete(folder, record, config)
+
+
+def identity(root: Path) -> dict[str, Any]:
+    """What data a run was trained on: name, and the checksum of all that is trained or validated on."""
+    digest, count = hashlib.sha256(), {}
+    for split in ("train", "validation"):
+        folders = list_sequences(root, split=split)
+        count[split] = len(folders)
+        for folder in folders:
+            digest.update(json.dumps([split, folder.name, read_manifest(folder).get("checksums")]).encode())
+    return {"train": count["train"], "validation": count["validation"], "sha256": digest.hexdigest()}
+
+
+def _check_same(folder: Path, record: dict[str, Any], wanted: dict[str, Any]) -> None:
+    parts = [differences(record.get(key, {}), wanted[key]) for key in ("data", "settings")]
+    changed = [*(f"data {text}" for text in parts[0]), *parts[1]]
+    if changed:
+        more = f", and {len(changed) - 4} more" if len(changed) > 4 else ""
+        raise RunMismatch(
+            f"{folder} holds a run with other settings: {'; '.join(changed[:4])}{more}. Every row of a table has the "
+            "same budget: give the settings it was made with, or other --runs"
+        )
+
+
+def _complete(folder: Path, record: dict[str, Any], config: TrainConfig) -> Run:
+    """The network of a complete run, checked to be the one that the record is about."""
+    file = folder / str(record.get("file"))
+    if not file.is_file() or _checksum(file) != record.get("sha256"):
+        raise RunMismatch(f"{folder}: {file.name} is missing or another than {RECORD} says; remove the folder")
+    shape = asdict(checkpoint.read_metadata(file)[0])
+    if shape != asdict(config.network_config()):
+        raise RunMismatch(f"{file}: {'; '.join(differences(shape, asdict(config.network_config())))}")
+    return Run(file, record.get("steps"), record.get("hours"))
+
+
+def _read(folder: Path) -> dict[str, Any] | None:
+    try:
+        record = json.loads((folder / RECORD).read_text("utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise RunMismatch(f"{folder / RECORD} cannot be read ({error}); remove the folder") from error
+    if not isinstance(record, dict):
+        raise RunMismatch(f"{folder / RECORD} is not a JSON object; remove the folder")
+    return record
+
+
+def _write(folder: Path, record: dict[str, Any]) -> None:
+    with atomic_file(folder / RECORD) as temporary:
+        temporary.write_text(json.dumps(record, indent=1), "utf-8")
+
+
+def _notes(path: Path) -> dict[str, Any]:
+    try:
+        return dict(checkpoint.read_metadata(path)[1])
+    except CheckpointError:
+        return {}
+
+
+def _checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
