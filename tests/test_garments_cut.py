@@ -20,6 +20,7 @@ from warpgarment.training.mesh_cutting import (
     evened_boundary,
     remeshed,
     split_at_zero,
+    without_flat_ears,
     without_short_edges,
     without_specks,
 )
@@ -288,3 +289,20 @@ def test_collapsing_thousands_of_edges_is_fast():
     assert time.process_time() - began < 10.0  # 1 s where this was written
     assert len(kept) < 5000
     assert area(done, kept) == pytest.approx(1.0, abs=0.01)
+
+
+def test_triangles_along_a_straight_border_go_and_the_shape_stays():
+    """If this fails, a garment remeshed to more faces has faces without area, which no Garment may have."""
+    x, y = np.meshgrid(np.arange(4.0), np.arange(2.0))
+    vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    square = [[k, k + 1, k + 5] for k in range(3)] + [[k, k + 5, k + 4] for k in range(3)]
+    ear = [4, 5, 8]  # below the straight border at y = 1, its tip in the middle of the edge from 4 to 5
+    vertices = np.concatenate([vertices, [[0.5, 1.0, 0.0]]])
+    faces = np.array([*square, ear])
+    kept, triangles = without_flat_ears(vertices, faces)
+    np.testing.assert_array_equal(triangles, square)
+    np.testing.assert_array_equal(kept, vertices[:8])
+    corner = np.concatenate([vertices[:8], [[0.5, 1.3, 0.0]]])  # an ear with area stays
+    assert len(without_flat_ears(corner, faces)[1]) == 7
+    inner = np.array([*square, [0, 2, 1]])  # flat, with one edge of the border only
+    assert len(without_flat_ears(vertices, inner)[1]) == 7

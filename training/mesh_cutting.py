@@ -186,6 +186,7 @@ def remeshed(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
         for rounds, shortest in ((12, 0.45), (4, 0.4)):
             points, triangles = remesh_botsch(points, triangles.astype(np.int32), i=rounds, h=aimed, project=True)
             points, triangles = without_short_edges(points, triangles, shortest * aimed)
+        points, triangles = without_flat_ears(points, triangles)
         if best is None or abs(len(triangles) - target_faces) < abs(len(best[1]) - target_faces):
             best = points, triangles
         ratio = len(triangles) / target_faces
@@ -193,6 +194,29 @@ def remeshed(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
             break
         aimed *= np.sqrt(ratio)
     return *best, edge
+
+
+def without_flat_ears(vertices: np.ndarray, faces: np.ndarray, limit: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Removes triangles of three vertices of a straight border, two of whose edges are the border: they have no area.
+
+    Args:
+        vertices: Shape [V, 3].
+        faces: Shape [F, 3].
+        limit: Area, as a share of the mean, below which a triangle is removed.
+
+    Returns:
+        The sheet without them and without the vertices only they had; its shape is the same.
+    """
+    while True:
+        area = np.asarray(igl.doublearea(vertices, faces.astype(np.int64)))
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        _, edge_of, uses = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+        borders = (uses[edge_of.ravel()] == 1).reshape(-1, 3).sum(axis=1)
+        flat = (borders == 2) & (area < limit * area.mean())
+        if not flat.any():
+            return vertices, faces
+        used, renumbered = np.unique(faces[~flat], return_inverse=True)
+        vertices, faces = vertices[used], renumbered.reshape(-1, 3)
 
 
 def without_short_edges(vertices: np.ndarray, faces: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
