@@ -169,6 +169,25 @@ def test_blender_is_given_the_body_and_the_pins_in_the_right_frames(tmp_path):
     assert not np.ptp(path[:, 0], axis=0).any(), "a vertex that is not pinned has no way to go"
 
 
+def test_several_cloths_are_kept_further_apart():
+    """If this fails, layers lie so close that Blender lets them through each other, or coarse cloth touches itself."""
+
+    def told(count: int, cells: int) -> tuple[float, float]:
+        sheet = _sheet(cells=cells)
+        scene = ClothScene(tuple(Cloth(sheet, 0.04) for _ in range(count)), frames=1)
+        edges = np.concatenate([np.diff(sheet.vertices[sheet.faces[:, c]], axis=1) for c in ([0, 1], [1, 2], [2, 0])])
+        return blender_numbers(scene, BlenderSettings())[0]["collision"]["self_distance_min"], float(
+            np.linalg.norm(edges, axis=-1).mean()
+        )
+
+    settings = BlenderSettings()
+    one, mean = told(1, 6)
+    assert mean > 4 * settings.layer_distance, "coarse enough for the whole distance"
+    assert told(2, 6)[0] / one == pytest.approx(settings.layer_distance / settings.self_distance)
+    fine, mean = told(2, 20)
+    assert fine / one == pytest.approx(0.25 * mean / settings.self_distance, rel=0.05)  # inner edges count twice here
+
+
 def test_numbers_stand_for_the_material():
     """If this fails, materials mean another cloth in Blender: compared with the mapping of the materials themselves.
 
