@@ -4,6 +4,7 @@
     warpgarment train --data sequences --out out/run --time-limit 60 --resume     # goes on where it stopped
     warpgarment train --data sequences --out out/run --steps 200000 --network base \\
         --precision bfloat16 --compile                                            # one GPU, so many steps
+    warpgarment train --data sequences --out out/base --network base --init small --grow ...  # starts as good as small
     torchrun --standalone --nproc-per-node 8 -m warpgarment train ...             # eight GPUs; same batches, shared
 
 Writes into the out folder: `network.safetensors` (averaged weights, ships), `best.safetensors` (the same at the best
@@ -26,6 +27,7 @@ from warpgarment import checkpoint
 from warpgarment.io.atomic import atomic_file
 from warpgarment.network import ManifoldAwareTransformer
 from warpgarment.training.distributed import Group, GroupError
+from warpgarment.training.grow import grow
 from warpgarment.training.loader import Plan
 from warpgarment.training.objective import CompileFailed
 from warpgarment.training.rate import spelt
@@ -47,6 +49,7 @@ def train(config: TrainConfig) -> Path:
     Raises:
         NoTrainingData: Nothing in the data folder is usable.
         NonFiniteLoss: Training diverged.
+        GrowthError: `init` cannot be grown to the shape wanted.
         CompileFailed: `compile` was asked for, and there is no compiler.
         CheckpointError: The state to resume from does not fit.
         GroupError: The processes cannot work together.
@@ -62,7 +65,9 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     group.part(config.batch_size)
     torch.manual_seed(config.seed)
     if config.init is not None:
-        network = checkpoint.load(config.init, device=group.device)
+        network = checkpoint.load(checkpoint.find(config.init), device=group.device)
+        if config.grow:
+            network = grow(network, config.network_config())
     else:
         network = ManifoldAwareTransformer(config.network_config()).to(group.device)
     skipped: dict[str, str] = {}

@@ -23,7 +23,9 @@ class TrainConfig:
         out: Folder for everything that is written.
         network: Shape to start from.
         overrides: Changes to it, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
-        init: Checkpoint to start from instead of random weights (its shape and statistics are kept).
+        init: Checkpoint to start from instead of random weights (its shape and statistics are kept): a file, a folder,
+            or the name of a network that ships.
+        grow: First grow `init` to the shape of `network` and `overrides`, without a change of what it predicts.
         steps: Number of steps; None: as many as `time_limit` allows.
         time_limit: Minutes after which the run stops cleanly, everything counted; None: no limit.
         batch_size: Samples per step, of all processes together; they share them evenly.
@@ -57,6 +59,7 @@ class TrainConfig:
     network: Literal["small", "base"] = "small"
     overrides: tuple[str, ...] = ("dropout=0.0",)
     init: Path | None = None
+    grow: bool = False
     steps: int | None = None
     time_limit: float | None = None
     batch_size: int = 16
@@ -91,6 +94,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.steps is None and self.time_limit is None:
             raise ValueError("give steps or time_limit (minutes), so that the schedule knows its end")
+        if self.grow and self.init is None:
+            raise ValueError("grow needs init, the network to grow")
         for name in ("batch_size", "splits", "validate_every", "save_every", "log_every", "statistics_batches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")

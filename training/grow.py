@@ -1,0 +1,170 @@
+"""A larger network that predicts what a smaller one does, to go on training from there.
+
+    warpgarment train --network base --overrides ... --init small.safetensors --grow ...
+
+Widening and deepening without a change of the function (Chen, Goodfellow and Shlens 2016, "Net2Net"), for the pre-norm
+encoder of `network.py`:
+
+- The residual stream is repeated: channel j of the large network holds channel j mod E of the small one. What writes
+  into it has its rows repeated; what reads it shares each weight unevenly among the copies, so that they part ways in
+  training. Layer norm does not notice, since mean and variance stay.
+- New heads, head channels and feed-forward channels start at random, with zeros where they are read. A learned head
+  that becomes wider has its queries scaled by sqrt(new width / old width), which its softmax divides by.
+- New layers write nothing at first, and lie evenly between the old ones.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+
+import torch
+from torch import nn
+
+from warpgarment.attention import EncoderLayer
+from warpgarment.config import NetworkConfig
+from warpgarment.network import STATISTICS, ManifoldAwareTransformer
+
+MAY_DIFFER = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "dropout")
+UNEVEN = 0.5  # how far the shares of the copies of a channel are from equal
+
+
+class GrowthError(ValueError):
+    """A shape that the network cannot be grown to; says which setting is in the way."""
+
+
+def grow(small: ManifoldAwareTransformer, config: NetworkConfig, *, seed: int = 0) -> ManifoldAwareTransformer:
+    """A network of another shape that predicts the same, on the device of the given one.
+
+    Args:
+        small: Network to start from; its statistics are kept.
+        config: Shape wanted: an embedding that is a multiple, at least as many layers, feed-forward channels, learned
+            heads and channels of each, and channels of all manifold heads together. `dropout` may differ, nothing else.
+        seed: Of what starts at random.
+
+    Raises:
+        GrowthError: The shape cannot be grown to.
+    """
+    _check(small.config, config)
+    device, dtype = small.face_head.weight.device, small.face_head.weight.dtype
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(seed)
+        large = ManifoldAwareTransformer(config).to(dtype)
+        _fill(large, copy.deepcopy(small).cpu())
+    return large.to(device).train(small.training)
+
+
+def _check(old: NetworkConfig, new: NetworkConfig) -> None:
+    for field in dataclasses.fields(NetworkConfig):
+        before, after = getattr(old, field.name), getattr(new, field.name)
+        if field.name not in MAY_DIFFER and before != after:
+            raise GrowthError(
+                f"{field.name} is {before!r} and cannot become {after!r}: that would be another function; add "
+                f"{field.name}={before} to the overrides"
+            )
+    if not old.norm_first:
+        raise GrowthError("the network normalises after its layers (norm_first=false): a new layer would change it")
+    if new.embedding % old.embedding:
+        raise GrowthError(f"embedding {new.embedding} is not a multiple of {old.embedding}")
+    widths = [(c.heads - c.manifold_heads, c.embedding // c.heads) for c in (old, new)]
+    (heads, width), (more, wider) = widths
+    manifold = [c.manifold_heads * c.embedding // c.heads for c in (old, new)]
+    wanted = {
+        "layers": (old.layers, new.layers),
+        "feed_forward": (old.feed_forward, new.feed_forward),
+        "learned heads": (heads, more),
+        "channels of manifold heads": (manifold[0], manifold[1]),
+    }
+    if heads:
+        wanted["channels of a head"] = (width, wider)
+    for name, (before, after) in wanted.items():
+        if after < before:
+            raise GrowthError(f"{name}: {after}, fewer than the {before} there are")
+
+
+def _fill(large: ManifoldAwareTransformer, small: ManifoldAwareTransformer) -> None:
+    copies = large.config.embedding // small.config.embedding
+    for name in STATISTICS:
+        getattr(large, name).copy_(getattr(small, name))
+    for writes in ("embed_faces", "embed_velocity"):
+        into, source = getattr(large, writes), getattr(small, writes)
+        into.weight.copy_(source.weight.repeat(copies, 1))
+        into.bias.copy_(source.bias.repeat(copies))
+    _norm(large.final_norm, small.final_norm, copies)
+    for reads in ("face_head", "velocity_head"):
+        into, source = getattr(large, reads), getattr(small, reads)
+        into.weight.copy_(_shared(source.weight, copies))
+        into.bias.copy_(source.bias)
+    before, after = small.config.layers, large.config.layers
+    places = {round(i * after / before): layer for i, layer in enumerate(small.layers)}
+    for place, layer in enumerate(large.layers):
+        if place in places:
+            _layer(layer, places[place], small.config, large.config)
+        else:
+            for writes in (layer.attention.out, layer.contract):
+                nn.init.zeros_(writes.weight)
+                nn.init.zeros_(writes.bias)
+
+
+def _layer(into: EncoderLayer, source: EncoderLayer, old: NetworkConfig, new: NetworkConfig) -> None:
+    copies = new.embedding // old.embedding
+    _norm(into.attention_norm, source.attention_norm, copies)
+    _norm(into.feed_forward_norm, source.feed_forward_norm, copies)
+
+    hidden = old.feed_forward
+    into.expand.weight[:hidden] = _shared(source.expand.weight, copies)
+    into.expand.bias[:hidden] = source.expand.bias
+    into.contract.weight.zero_()
+    into.contract.weight[:, :hidden] = source.contract.weight.repeat(copies, 1)
+    into.contract.bias.copy_(source.contract.bias.repeat(copies))
+
+    # Rows of `qkv`: queries and keys of the manifold heads (unused), those of the learned heads, then all values.
+    channels, parts = _head_channels(old, new)
+    width = old.embedding // old.heads, new.embedding // new.heads
+    scale = {"query": math.sqrt(width[1] / width[0])}
+    into.attention.out.weight.zero_()
+    into.attention.out.bias.copy_(source.attention.out.bias.repeat(copies))
+    for name, rows_old, rows_new in parts:
+        where = channels["value" if name == "value" else "learned"]
+        weight, bias = source.attention.qkv.weight[rows_old], source.attention.qkv.bias[rows_old]
+        into.attention.qkv.weight[rows_new][where] = scale.get(name, 1.0) * _shared(weight, copies)
+        into.attention.qkv.bias[rows_new][where] = scale.get(name, 1.0) * bias
+        if name == "query" and width[1] > width[0]:  # old heads compare by their old channels alone
+            fresh = torch.ones(rows_new.stop - rows_new.start, dtype=torch.bool)
+            fresh[(old.heads - old.manifold_heads) * width[1] :] = False
+            fresh[where] = False
+            into.attention.qkv.weight[rows_new][fresh] = 0.0
+    where = channels["value"]
+    into.attention.out.weight[:, where] = source.attention.out.weight.repeat(copies, 1)
+
+
+def _head_channels(
+    old: NetworkConfig, new: NetworkConfig
+) -> tuple[dict[str, torch.Tensor], list[tuple[str, slice, slice]]]:
+    """Which channels of the new heads hold the old ones, and the rows of `qkv` of queries, keys and values."""
+    width_old, width_new = old.embedding // old.heads, new.embedding // new.heads
+    learned_old, learned_new = ((c.heads - c.manifold_heads) * c.embedding // c.heads for c in (old, new))
+    number = torch.arange(learned_old)
+    learned = number // width_old * width_new + number % width_old
+    manifold = learned_new + torch.arange(old.embedding - learned_old)
+    channels = {"learned": learned, "value": torch.cat([learned, manifold])}
+    parts = []
+    starts = [2 * (c.embedding - n) for c, n in ((old, learned_old), (new, learned_new))]
+    lengths = [(learned_old, learned_new), (learned_old, learned_new), (old.embedding, new.embedding)]
+    for name, (before, after) in zip(("query", "key", "value"), lengths, strict=True):
+        parts.append((name, slice(starts[0], starts[0] + before), slice(starts[1], starts[1] + after)))
+        starts = [starts[0] + before, starts[1] + after]
+    return channels, parts
+
+
+def _norm(into: nn.Module, source: nn.Module, copies: int) -> None:
+    for name in ("weight", "bias"):
+        getattr(into, name).copy_(getattr(source, name).repeat(copies))
+
+
+def _shared(weight: torch.Tensor, copies: int) -> torch.Tensor:
+    """Weights [O,E] that read a repeated stream [copies * E] as they read it once: uneven shares that sum to one."""
+    share = torch.rand(copies, *weight.shape, dtype=weight.dtype) - 0.5
+    share = 1.0 / copies + UNEVEN / copies * 2.0 * (share - share.mean(0))
+    return (share * weight).transpose(0, 1).reshape(len(weight), -1)
