@@ -7,8 +7,8 @@ from typing import Any, Literal, cast
 
 from warpgarment import checkpoint
 from warpgarment.simulator import Simulator
-from warpgarment.training.dataset import list_sequences
 from warpgarment.training.train import TrainConfig
+from warpgarment.training.training_set import folders_of
 
 from . import variants
 from .errors import DataLacks, OptionMissing
@@ -39,11 +39,14 @@ def make(config: Any) -> dict[str, Any]:
         OptionMissing, DataLacks: No budget, no data, no test sequences.
     """
     configs, chosen = plan(config)
-    root = Path(config.data)
-    folders = evenly(list_sequences(root, split=config.split), config.max_sequences)
+    root, skipped = Path(config.data), dict[str, str]()
+    folders = evenly(folders_of(root, config.split, skipped), config.max_sequences)
     if not folders:
-        raise DataLacks(f"{root}: no {config.split} sequences. `warpgarment generate --out DIR` makes a set with some")
-    data, rows, skipped = identity(root), [], {}
+        unread = f" ({len(skipped)} have no readable manifest)" if skipped else ""
+        raise DataLacks(
+            f"{root}: no {config.split} sequences{unread}. `warpgarment generate --out DIR` makes a set with some"
+        )
+    data, rows = identity(root), []
     runs = {v.name: trained(Path(config.tables.runs) / config.table / v.name, configs[v.name], data) for v in chosen}
     for variant in chosen:
         run = runs[variant.name]

@@ -16,8 +16,9 @@ from typing import Any
 from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
-from warpgarment.training.dataset import list_sequences, read_manifest
+from warpgarment.training.dataset import read_manifest
 from warpgarment.training.train import TrainConfig, train
+from warpgarment.training.training_set import folders_of
 
 from .settings import described, differences
 
@@ -80,7 +81,7 @@ def identity(root: Path) -> dict[str, Any]:
     """What data a run was trained on: name, and the checksum of all that is trained or validated on."""
     digest, count = hashlib.sha256(), {}
     for split in ("train", "validation"):
-        folders = list_sequences(root, split=split)
+        folders = folders_of(root, split, {})  # as training does, which says what it skips
         count[split] = len(folders)
         for folder in folders:
             digest.update(json.dumps([split, folder.name, read_manifest(folder).get("checksums")]).encode())
