@@ -36,6 +36,9 @@ __all__ = [
 FORMAT = 2
 MANIFEST = "manifest.json"
 _LARGE = ("garment_positions", "body_positions", "garment_vertices")  # mapped; others would cost an open file each
+_OF_FRAMES = (  # of the body, by frame: format 1, then 2
+    "bone_transforms", "bone_rotations", "bone_translations", "bone_origins", "body_positions", "body_boxes",
+)  # fmt: skip
 _ONE_OF_TWO_BODIES = {"body_vertices", "bone_transforms"}
 
 
@@ -155,15 +158,22 @@ class Sequence:
 
     def body(self) -> BodyMotion:
         """The faces cloth collides with (no hands and forearms), vertices compacted."""
-        return self.full_body().submesh(self._array("collider_faces"))
+        return self.full_body().submesh(self.collider_faces)
 
-    def body_in(self, frames: slice) -> BodyMotion:
-        """The whole body in some of the frames."""
+    @property
+    def collider_faces(self) -> np.ndarray:
+        """Which faces of the whole body cloth collides with, bool [G]."""
+        return self._array("collider_faces")
+
+    def body_in(self, frames: slice | list[int]) -> BodyMotion:
+        """The whole body in some of the frames; others are not decoded."""
+        some = {name: array[frames] if name in _OF_FRAMES else array for name, array in self._stored.items()}
+        part = Sequence(self.folder, self.manifest, some)
         if "body_positions" in self._stored:
-            vertices = self._array("body_vertices")[frames]
+            vertices = part._array("body_vertices")
         else:
-            rest, bones, weights = map(self._array, ("body_rest_vertices", "bone_indices", "bone_weights"))
-            vertices = linear_blend_skinning(rest, bones, weights, self._array("bone_transforms")[frames])
+            names = "body_rest_vertices", "bone_indices", "bone_weights", "bone_transforms"
+            vertices = linear_blend_skinning(*map(part._array, names))
         return BodyMotion(vertices, self._array("body_faces"), self.fps)
 
     def arrays(self) -> dict[str, np.ndarray]:

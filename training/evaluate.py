@@ -27,10 +27,20 @@ import tyro
 from warpgarment import checkpoint
 from warpgarment.errors import MissingExtra
 from warpgarment.simulator import Simulator
-from warpgarment.training.dataset import list_sequences
 from warpgarment.training.tables.errors import OptionMissing
 from warpgarment.training.tables.options import TableName, TableOptions
-from warpgarment.training.tables.protocol import FIGURES, METHODS, STARTS, cells, evenly, means, measure, plain
+from warpgarment.training.tables.protocol import (
+    FIGURES,
+    METHODS,
+    STARTS,
+    cells,
+    evenly,
+    means,
+    measure,
+    plain,
+    skipped_lines,
+)
+from warpgarment.training.training_set import folders_of
 
 
 class NoTestData(ValueError):
@@ -44,8 +54,8 @@ class EvaluateConfig:
     Attributes:
         data: Folder of sequences.
         out: Folder for the results; those of tables go to benchmarks/results by default.
-        network: Checkpoint file or folder, or the name of a network that ships. table1 and table2 train networks of
-            their own: small or base, the shape to start from ("default" is small).
+        network: Checkpoint file or folder, or the name of a network that ships. table1, table2 and recipe train
+            networks of their own: small or base, the shape to start from ("default" is small).
         split: Which sequences.
         frames: Most frames predicted per sequence; None: all there are.
         geodesic_frames: Frames per rollout at which geodesic distortion is sampled, evenly spaced.
@@ -78,8 +88,8 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
 
     Returns:
         `settings`, `network` (file, config, notes), `sequences` (per sequence and start: figures of each method),
-        `mean` (start -> method -> figures), `skipped` (name -> reason), `frames_predicted`, `seconds_per_frame`; for
-        tables what `tables.make_table` returns.
+        `mean` (start -> method -> figures), `skipped` (name -> reason), `skipped_count`, `frames_predicted`,
+        `seconds_per_frame`; for tables what `tables.make_table` returns.
 
     Raises:
         OptionMissing: No data or no out folder.
@@ -102,7 +112,8 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
             raise OptionMissing(f"an evaluation needs --{name} FOLDER")
     path = checkpoint.find(config.network, device=config.device)
     simulator = Simulator(checkpoint.load(path), config.device)
-    folders = evenly(list_sequences(Path(config.data), split=config.split), config.max_sequences)
+    skipped: dict[str, str] = {}
+    folders = evenly(folders_of(Path(config.data), config.split, skipped), config.max_sequences)
     found = measure(
         simulator,
         folders,
@@ -110,8 +121,9 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         geodesic_frames=config.geodesic_frames,
         baselines=config.baselines,
     )
+    skipped |= found.skipped
     if not found.rows:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(found.skipped.items())[:3])
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
         raise NoTestData(f"{config.data}: no {config.split} sequence to evaluate ({reasons or 'none found'})")
     settings = {k: v for k, v in vars(config).items() if k not in ("table", "tables")}
     result = {
@@ -121,7 +133,8 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         "seconds_per_frame": found.seconds / max(found.frames, 1),
         "mean": means(found.rows),
         "sequences": found.rows,
-        "skipped": found.skipped,
+        "skipped": skipped,
+        "skipped_count": len(skipped),
     }
     write(Path(config.out), result, found.curves, picture=config.picture)
     return result
@@ -157,7 +170,7 @@ def table(result: dict[str, Any]) -> str:
         for method in METHODS:
             if method in row:
                 lines.append(_row([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])]))
-    lines += ["", *(f"Skipped {name}: {reason}" for name, reason in result["skipped"].items())]
+    lines += ["", *skipped_lines(result["skipped"])]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -84,12 +84,16 @@ class Loader:
         splits = self.splits(step) if splits is None else splits
         faces = max(min(int(self.plan.sizes[s]) for s, _ in picks) // splits, 1)
         displacements: list[np.ndarray | None] = [None] * len(picks)
-        fitting = self.pool.fitting(self.plan.sizes, faces)
+        fitting = [entry for entry in self.pool.fitting(self.plan.sizes, faces) if self._reaches(*entry)]
         for b in range(len(picks)):
             if len(fitting) and rng.random() < self.share:
                 s, t, displacements[b] = self.pool.entry(*fitting[rng.integers(len(fitting))])
                 picks[b] = (s, t)
         return self.builder.build(picks, faces, rng, displacements, self.part if part is None else part)
+
+    def _reaches(self, rollout: int, last: int) -> bool:
+        """Whether enough recorded frames follow a frame of the pool."""
+        return self.builder.reaches(*self.pool.entry(rollout, last)[:2])
 
     def batches(self, start: int, stop: int) -> Iterator[Batch]:
         """The batches of steps start..stop-1, in order."""

@@ -57,15 +57,46 @@ def loss(
             a part of a batch, the whole batch's number times the share that the part is: then the mean over equal parts
             is the loss of the whole.
     """
-    parts = [(a.float() - b).abs() for a, b in zip(predicted, target, strict=True)]
-    if config.units == "physical":
-        scale = (network.psi_std, network.singular_value_std, network.q_std)
-        parts = [part * s for part, s in zip(parts, scale, strict=True)]
-    deformation, singular_values, velocity = (part.sum(dim=-1) for part in parts)
+    deformation, singular_values, velocity = _differences(predicted, target, network, config)
     deformation, singular_values = deformation.mean(), singular_values.mean()
     if velocity_mask is not None:
         velocity = torch.where(velocity_mask, velocity, 0.0)
         components = velocity_mask.sum() if components is None else components
     velocity = velocity.mean() if components is None else velocity.sum() / components
+    return _summed(deformation, singular_values, velocity, config)
+
+
+def weighted(
+    predicted: NormalisedOutput,
+    target: NormalisedOutput,
+    network: ManifoldAwareTransformer,
+    config: LossConfig,
+    face_weight: torch.Tensor,
+    component_weight: torch.Tensor,
+) -> Losses:
+    """The same with a weight for each face [B,N] and each component [B,C], which is 0 where it is none."""
+    deformation, singular_values, velocity = _differences(predicted, target, network, config)
+    parts = (
+        (deformation * face_weight).sum(),
+        (singular_values * face_weight).sum(),
+        (velocity * component_weight).sum(),
+    )
+    return _summed(*parts, config)
+
+
+def _differences(
+    predicted: NormalisedOutput, target: NormalisedOutput, network: ManifoldAwareTransformer, config: LossConfig
+) -> list[torch.Tensor]:
+    """Sums of absolute differences per face [B,N], [B,N], and per component [B,C]."""
+    parts = [(a.float() - b).abs() for a, b in zip(predicted, target, strict=True)]
+    if config.units == "physical":
+        scale = (network.psi_std, network.singular_value_std, network.q_std)
+        parts = [part * s for part, s in zip(parts, scale, strict=True)]
+    return [part.sum(dim=-1) for part in parts]
+
+
+def _summed(
+    deformation: torch.Tensor, singular_values: torch.Tensor, velocity: torch.Tensor, config: LossConfig
+) -> Losses:
     total = config.deformation * deformation + config.singular_values * singular_values + config.velocity * velocity
     return Losses(total, deformation, singular_values, velocity)

@@ -17,6 +17,8 @@ from warpgarment.parametrisation import NetworkOutput
 from warpgarment.training.distributed import Group
 from warpgarment.training.losses import LossConfig, loss
 from warpgarment.training.samples import Batch
+from warpgarment.training.unroll import UnrolledObjective
+from warpgarment.training.unroll_samples import UnrolledBatch
 
 
 class CompileFailed(RuntimeError):
@@ -33,9 +35,23 @@ class Objective(nn.Module):
         precision: "float32" or "bfloat16".
     """
 
+    figures = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity")
+
     def __init__(self, network: ManifoldAwareTransformer, config: LossConfig, noise: float, precision: str) -> None:
         super().__init__()
         self.network, self.config, self.noise, self.half = network, config, noise, precision == "bfloat16"
+
+    @staticmethod
+    def inputs(batch: Batch) -> tuple:
+        """What `forward` takes."""
+        return (
+            batch.features,
+            batch.velocities,
+            batch.weights,
+            batch.velocity_mask,
+            batch.components,
+            tuple(batch.target),
+        )
 
     def forward(
         self,
@@ -66,23 +82,23 @@ class Trainer:
     the mean over all faces; `Batch.components` makes it so for components.
     """
 
-    def __init__(self, objective: Objective, group: Group, compile: bool) -> None:
-        self.compiled, self._worked = compile, False
+    def __init__(self, objective: Objective | UnrolledObjective, group: Group, compile: bool) -> None:
+        self.compiled, self._worked, self._inputs = compile, False, objective.inputs
         if compile:
             objective.compile(dynamic=True)  # the number of faces changes from batch to batch
         self._model: nn.Module = objective
         if group.size > 1:
             self._model = DistributedDataParallel(objective, gradient_as_bucket_view=True)
 
-    def backward(self, batch: Batch) -> torch.Tensor:
-        """Leaves the gradient in the weights, and returns this process's losses [4]; waits for nothing.
+    def backward(self, batch: Batch | UnrolledBatch) -> torch.Tensor:
+        """Leaves the gradient in the weights, and returns this process's losses, which the objective's `figures` name;
+        waits for nothing.
 
         Raises:
             CompileFailed: On the first step, where the compiler is not there.
         """
-        inputs = (batch.features, batch.velocities, batch.weights, batch.velocity_mask, batch.components)
         try:
-            losses = self._model(*inputs, tuple(batch.target))
+            losses = self._model(*self._inputs(batch))
             losses[0].backward()
         except Exception as error:
             if not self.compiled or self._worked or not type(error).__module__.startswith(("torch._", "triton")):

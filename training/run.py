@@ -16,7 +16,6 @@ from warpgarment import checkpoint
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.training import state as training_state
 from warpgarment.training.distributed import Group
-from warpgarment.training.flops import step_flops
 from warpgarment.training.loader import Loader, Plan
 from warpgarment.training.objective import Objective, Trainer
 from warpgarment.training.pushforward import Pool
@@ -26,8 +25,9 @@ from warpgarment.training.run_log import RunLog, json_number
 from warpgarment.training.samples import Batch, SampleBuilder
 from warpgarment.training.statistics import statistics
 from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.unroll import UnrolledObjective
+from warpgarment.training.unroll_samples import UnrolledBatch, UnrolledBuilder
 
-FIGURES = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity", "gradient_norm")  # of each step
 STATE = "state.safetensors"
 SHARED_OUT = "All machines must see the same out folder."
 
@@ -56,7 +56,17 @@ class Run:
         self.config, self.network, self.validation, self.began = config, network, validation, began
         self.out, self.group, self.device = Path(config.out), group, group.device
         self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
-        self.loader = Loader(builder, plan, self.pool, config.pushforward.share, self.splits, config.ahead, part)
+        if config.unroll.steps > 1:
+            builder = UnrolledBuilder(
+                builder.sequences,
+                network,
+                config.noise,
+                config.augmentation,
+                config.unroll.steps,
+                config.unroll.collision_passes,
+            )
+        ahead = config.ahead if config.unroll.steps == 1 else 0  # a scene's solvers belong to one thread
+        self.loader = Loader(builder, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
@@ -123,14 +133,19 @@ class Run:
             self.pool.step, self.recent = progress["pool_step"], progress.get("recent", [])
         elif config.init is None and group.first:
             steps = range(2**30, 2**30 + config.statistics_batches)  # far from those of the run
-            batches = (self.loader.build(step, splits=config.splits, part=slice(None)) for step in steps)
+            single = Loader(self.builder, self.loader.plan, Pool(), 0.0, self.splits)  # of one step, unrolled or not
+            batches = (single.build(step, splits=config.splits, part=slice(None)) for step in steps)
             self.network.set_statistics(statistics(batches, self.network))
         group.agree("the step to resume from", self.step, SHARED_OUT)
         if not resumed:
             group.same(self.network.state_dict().values())
             self.average.update(self.network)
         self.log = RunLog(self.out if group.first else None, self.step if resumed else None)
-        objective = Objective(self.network, config.loss, config.noise.features, config.precision)
+        settings = (self.network, config.loss, config.noise.features, config.precision)
+        unrolled = config.unroll.steps > 1
+        objective = UnrolledObjective(*settings, config.unroll) if unrolled else Objective(*settings)
+        self.names = (*objective.figures, "gradient_norm")
+        self.recent = [row for row in self.recent if len(row) == len(self.names)]  # else of another objective
         self.trainer = Trainer(objective, group, config.compile)
         self.look_at_clock()
         self.whole_from = self.step if self.progress(self.step) >= config.split_share else math.inf
@@ -166,7 +181,7 @@ class Run:
             self.look_at_clock()
         bar.close()
 
-    def update(self, batch: Batch) -> None:
+    def update(self, batch: Batch | UnrolledBatch) -> None:
         """One step of the optimiser; nothing here waits for the device."""
         config, network = self.config, self.network
         torch.manual_seed(config.seed * 1_000_003 + self.step + 2**40 * self.group.rank)  # dropout and feature noise
@@ -178,8 +193,7 @@ class Run:
         self.optimizer.step()
         self.average.update(network)
         self.unread.append(torch.cat([losses, norm.detach()[None]]))
-        samples, faces = batch.features.shape[:2]
-        self.rate.count(samples, step_flops(network.config, samples, faces, batch.velocities.shape[1]))
+        self.rate.count(*batch.work(network.config))
 
     def read_losses(self) -> None:
         """Fetches the figures of the steps since the last time; stops the run where one is not finite."""
@@ -271,7 +285,7 @@ class Run:
         means = map(float, np.mean(self.recent, axis=0))
         self.recent.clear()
         self.figures = self.rate.take()
-        entry = dict(zip(FIGURES, means, strict=True))
+        entry = dict(zip(self.names, means, strict=True))
         bar.set_postfix_str(f"loss {entry['loss']:.3f}, {spelt(self.figures)}", refresh=False)
         entry["lr"] = self.optimizer.param_groups[0]["lr"]
         self.log.write(self.step, self.elapsed(), entry | self.figures)
@@ -284,11 +298,9 @@ class Run:
         path = self.out / f"not_finite_{step}.npz"
         if self.group.first:
             batch = self.loader.build(step, part=slice(None))
-            arrays = {"features": batch.features, "velocities": batch.velocities, "weights": batch.weights}
-            arrays |= batch.target._asdict()
             names = np.array([name for name, _ in batch.ids])
             frames = np.array([frame for _, frame in batch.ids])
-            np.savez(path, sequence=names, frame=frames, **{k: v.cpu().numpy() for k, v in arrays.items()})
+            np.savez(path, sequence=names, frame=frames, **batch.arrays())
         self.group.wait()
         raise NonFiniteLoss(
             f"the loss or gradient of step {step} is not finite; its batch is in {path}. Look for features that are "

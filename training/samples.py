@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from warpgarment.config import NetworkConfig
 from warpgarment.heading import rotation_about_up
 from warpgarment.kernels.deformation import (
     deformation_gradient_from_inverse,
@@ -31,6 +32,7 @@ from warpgarment.kernels.deformation import (
 from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
 from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.training.augmentation import Augmentation, mirror
+from warpgarment.training.flops import step_flops
 from warpgarment.training.interactions import COLUMNS, unpack
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.sequence_data import SequenceData
@@ -50,6 +52,16 @@ class Batch(NamedTuple):
     target: NetworkOutput  # what the network should say
     ids: list[tuple[str, int]]  # sequence, newest frame
 
+    def work(self, config: NetworkConfig) -> tuple[int, int]:
+        """Samples, and operations of a training step on them (`flops.py`)."""
+        samples, faces = self.features.shape[:2]
+        return samples, step_flops(config, samples, faces, self.velocities.shape[1])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What is kept of a batch whose loss is not finite."""
+        tensors = {"features": self.features, "velocities": self.velocities, "weights": self.weights}
+        return {name: tensor.cpu().numpy() for name, tensor in (tensors | self.target._asdict()).items()}
+
 
 class SampleBuilder:
     """Builds batches.
@@ -65,6 +77,10 @@ class SampleBuilder:
         self.sequences, self.network = sequences, network
         self.noise, self.augmentation = noise, augmentation
         self.device = sequences[0].device
+
+    def reaches(self, sequence: int, newest: int) -> bool:
+        """Whether the recorded frames that a sample needs follow a frame."""
+        return newest < self.sequences[sequence].count
 
     @torch.no_grad()
     def build(
@@ -109,7 +125,7 @@ class SampleBuilder:
             subset = self._send(subset)
             frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
             past = sequence.vertices[frames]
-            delta = self._displacement(sequence, rng, displacements[b])
+            delta = self.displacement(sequence, rng, displacements[b])
             if delta is not None:
                 first = max(history - 1 - t, 0)  # frames before the first repeat it, displaced as it is
                 past = past + self._send(delta[np.maximum(np.arange(history), first)])
@@ -202,7 +218,7 @@ class SampleBuilder:
             return values.to(self.device)
         return values.pin_memory().to(self.device, non_blocking=True)
 
-    def _displacement(
+    def displacement(
         self, sequence: SequenceData, rng: np.random.Generator, override: np.ndarray | None
     ) -> np.ndarray | None:
         """[history,V,3]: noise plus the override of the newest frames; None where there is neither."""

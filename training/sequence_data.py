@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from warpgarment.body import BodyMotion
+from warpgarment.garment import Garment
 from warpgarment.heading import yaw
 from warpgarment.kernels.deformation import deformation_gradient_from_inverse, inverse_rest_frames
 from warpgarment.kernels.laplacian import components
@@ -64,6 +65,25 @@ class SequenceData:
     def body(self) -> BodyMotion:
         """The collider, for rollouts."""
         return self.source.body()
+
+    @cached_property
+    def garment(self) -> Garment:
+        """The garment, with the cached geodesics, for unrolled samples."""
+        garment = self.source.garment
+        garment.__dict__.setdefault("geodesics", self._geodesics)
+        return garment
+
+    def body_frames(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """The collider in some frames: vertices [T,U,3] in metres and faces [G,3]."""
+        used, faces = self._collider
+        return self.source.body_in(frames).vertices[:, used], faces
+
+    @cached_property
+    def _collider(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices of the body that colliding faces use [U], and these faces in terms of them [G,3]."""
+        faces = self.source.body_in([0]).faces[self.source.collider_faces]
+        used, inverse = np.unique(faces, return_inverse=True)
+        return used, inverse.reshape(-1, 3)
 
     @property
     def count(self) -> int:

@@ -75,7 +75,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
         sequences = load_sequences(config, network.config, skipped, group)
         validation = load_validation(config, skipped) if group.first else []
         builder = SampleBuilder(sequences, network.config, config.noise, config.augmentation)
-        sizes, counts = [len(s.faces) for s in sequences], [s.count for s in sequences]
+        sizes, counts = [len(s.faces) for s in sequences], [s.count - config.unroll.steps + 1 for s in sequences]
         plan = Plan(sizes, counts, config.batch_size, config.seed)
         run = Run(config, network, plan, builder, validation, began, group)
         if group.first:

@@ -12,6 +12,7 @@ from warpgarment.training.augmentation import Augmentation
 from warpgarment.training.losses import LossConfig
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.pushforward import PushforwardConfig
+from warpgarment.training.unroll import UnrollConfig
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ class TrainConfig:
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     augmentation: Augmentation = field(default_factory=Augmentation)
     pushforward: PushforwardConfig = field(default_factory=PushforwardConfig)
+    unroll: UnrollConfig = field(default_factory=UnrollConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     validate_every: int = 500
     validate_frames: int = 60
@@ -99,6 +101,11 @@ class TrainConfig:
         for name in ("batch_size", "splits", "validate_every", "save_every", "log_every", "statistics_batches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+        if self.unroll.steps > 1 and self.compile:
+            raise ValueError("unrolled training is not compiled: leave out compile, or set unroll.steps to 1")
+        if self.unroll.steps > 1 and self.augmentation.scale:
+            raise ValueError("unrolled samples keep their size: set augmentation.scale to 0, or unroll.steps to 1")
 
     def network_config(self) -> NetworkConfig:
         """The network's shape with the overrides applied."""

@@ -42,14 +42,14 @@ def load_sequences(
             try:
                 cached(Sequence.load(folder), folder, cache, group.device)
             except Exception as error:
-                _expect_bad_data(error)
+                reason_of(error)
         group.wait()
     sequences = []
     for folder in _watched(folders, group):
         try:
             sequences.append(SequenceData(Sequence.load(folder), folder, cache, network, group.device))
         except Exception as error:
-            skipped[folder.name] = _expect_bad_data(error)
+            skipped[folder.name] = reason_of(error)
     names = "\n".join(f"{s.name} {len(s.faces)} {s.count}" for s in sequences)
     group.agree("the checksum of the usable sequences", zlib.crc32(names.encode()), SAME_DATA)
     if not sequences:
@@ -74,13 +74,13 @@ def load_validation(config: TrainConfig, skipped: dict[str, str]) -> list[tuple[
                 raise ValueError("too short, or not finite")
             found.append((sequence, body, frames - 1))
         except Exception as error:
-            skipped[folder.name] = _expect_bad_data(error)
+            skipped[folder.name] = reason_of(error)
     return found
 
 
-def folders_of(root: Path, split: str, skipped: dict[str, str]) -> list[Path]:
-    """Good sequences of a split, as `list_sequences` gives them, but that a manifest which is missing or cannot be read
-    only costs its own sequence.
+def folders_of(root: Path, split: str | None, skipped: dict[str, str]) -> list[Path]:
+    """Good sequences of a split (None: of all), as `list_sequences` gives them, but that a manifest which is missing or
+    cannot be read only costs its own sequence, and goes to `skipped` with the reason.
 
     Raises:
         FileNotFoundError: There is no such folder.
@@ -95,7 +95,7 @@ def folders_of(root: Path, split: str, skipped: dict[str, str]) -> list[Path]:
             if any(folder.glob("*.npy")):  # else it is no sequence
                 skipped[folder.name] = str(error)
             continue
-        if manifest.get("split") == split and manifest.get("status") == "good":
+        if split in (None, manifest.get("split")) and manifest.get("status") == "good":
             found.append(folder)
     return found
 
@@ -108,8 +108,12 @@ def report(skipped: dict[str, str]) -> str:
     return "\n".join([f"{len(skipped)} sequence{'s' if len(skipped) > 1 else ''} skipped:", *lines])
 
 
-def _expect_bad_data(error: Exception) -> str:
-    """The reason for a skip; an error that is not the data's fault goes on."""
+def reason_of(error: Exception) -> str:
+    """The reason for a skip, as text.
+
+    Raises:
+        MemoryError, torch.OutOfMemoryError: The error itself, where it is not the data's fault.
+    """
     if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
         raise error
     return f"{type(error).__name__}: {error}"

@@ -2,6 +2,7 @@
 
     warpgarment evaluate --table table1 --data DATA --steps 20000       # manifold heads, singular values
     warpgarment evaluate --table table2 --data DATA --steps 20000       # power and radius of the geodesic attention
+    warpgarment evaluate --table recipe --data DATA --time-limit 60     # what each training setting is worth
     warpgarment evaluate --table figure5                                # time by stage
     warpgarment evaluate --table figure7 --data DATA                    # one garment at several resolutions
     warpgarment evaluate --table figure9 --data SEAMS                   # unseen seam cuts
@@ -20,6 +21,7 @@ from typing import Any
 MAKERS = {
     "table1": "compare",
     "table2": "compare",
+    "recipe": "compare",
     "figure5": "figure5",
     "figure7": "figure7",
     "figure9": "groups",

@@ -1,4 +1,5 @@
-"""Tables 1 and 2: networks that differ in one setting, trained on one budget, measured on the same sequences."""
+"""Tables 1 and 2 and that of the recipe: networks that differ in one setting, trained on one budget, measured on the
+same sequences."""
 
 from __future__ import annotations
 
@@ -7,10 +8,10 @@ from typing import Any, Literal, cast
 
 from warpgarment import checkpoint
 from warpgarment.simulator import Simulator
-from warpgarment.training.dataset import list_sequences
-from warpgarment.training.train import TrainConfig
+from warpgarment.training.train import NonFiniteLoss, TrainConfig
+from warpgarment.training.training_set import folders_of
 
-from . import variants
+from . import recipe, variants
 from .errors import DataLacks, OptionMissing
 from .pictures import bars, sweeps
 from .protocol import evenly, means, measure
@@ -21,6 +22,7 @@ from .settings import with_settings
 TITLES = {
     "table1": "Table 1: what manifold heads and singular values are worth",
     "table2": "Table 2: power and radius of the geodesic attention",
+    "recipe": "The recipe: what each training setting is worth",
 }
 PAPER = {
     "table1": "The paper, on its own data: 4.54 cm without manifold heads, 12.2 without singular values, 3.19 in full; "
@@ -39,13 +41,26 @@ def make(config: Any) -> dict[str, Any]:
         OptionMissing, DataLacks: No budget, no data, no test sequences.
     """
     configs, chosen = plan(config)
-    root = Path(config.data)
-    folders = evenly(list_sequences(root, split=config.split), config.max_sequences)
+    root, skipped = Path(config.data), dict[str, str]()
+    folders = evenly(folders_of(root, config.split, skipped), config.max_sequences)
     if not folders:
-        raise DataLacks(f"{root}: no {config.split} sequences. `warpgarment generate --out DIR` makes a set with some")
-    data, rows, skipped = identity(root), [], {}
-    runs = {v.name: trained(Path(config.tables.runs) / config.table / v.name, configs[v.name], data) for v in chosen}
+        unread = f" ({len(skipped)} have no readable manifest)" if skipped else ""
+        raise DataLacks(
+            f"{root}: no {config.split} sequences{unread}. `warpgarment generate --out DIR` makes a set with some"
+        )
+    data, rows = identity(root), []
+    runs, diverged = {}, dict[str, str]()
     for variant in chosen:
+        folder = Path(config.tables.runs) / config.table / variant.name
+        try:
+            runs[variant.name] = trained(folder, configs[variant.name], data)
+        except NonFiniteLoss as error:
+            diverged[variant.name] = str(error).partition(";")[0]
+    if not runs:
+        raise DataLacks(
+            f"every row's training diverged ({'; '.join(diverged.values())}); give a lower lr in --settings"
+        )
+    for variant in (v for v in chosen if v.name in runs):
         run = runs[variant.name]
         simulator = Simulator(checkpoint.load(run.file), config.device)
         baselines = config.baselines and not rows  # they are the same for all rows
@@ -62,15 +77,22 @@ def make(config: Any) -> dict[str, Any]:
             {"row": variant.name, "label": variant.label, "mean": own, "steps": run.steps, "hours": run.hours}
             | {"value": dict(variant.value), "overrides": variant.overrides, "settings": variant.settings}
             | {"parameters": simulator.network.parameter_count(), "sequences": found.rows}
+            | {"validation_cm": None if run.validation is None else round(run.validation, 2)}
         )
         if baselines:
             beside = {s: {m: f for m, f in methods.items() if m in BASELINES} for s, methods in mean.items()}
     if config.baselines:
         rows.append({"row": "baselines", "label": "", "mean": beside})
     result = {"table": config.table, "title": TITLES[config.table], "protocol": PROTOCOL, "data": data}
-    result |= {"budget": _budget(config), "rows": rows, "skipped": skipped}
+    result |= {"budget": _budget(config), "rows": rows, "diverged": diverged, "skipped": skipped}
     body = [PROTOCOL, "", f"Every row: {_budget(config)}.", ""]
-    body += [*means_table(rows, {"steps": "steps", "hours": "hours"}), "", PAPER[config.table]]
+    if config.table == "recipe":
+        body += _recipe(config, rows, configs)
+    else:
+        body += [*means_table(rows, {"steps": "steps", "hours": "hours"}), "", PAPER[config.table]]
+    body += [
+        line for name, reason in diverged.items() for line in ("", f"No row {name}, its training ended: {reason}.")
+    ]
     draw = sweeps if config.table == "table2" else bars
     publish(config, result, body, lambda path: draw(path, rows))
     return result
@@ -86,10 +108,26 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
     shape = "small" if config.network == "default" else config.network
     if shape not in ("small", "base"):
         raise OptionMissing(f"{config.table} trains networks of its own; --network is their shape, small or base")
+    common = _common(config, cast(Literal["small", "base"], shape))
+    variants.check_different({"all": common})  # says so if an override does not exist
+    if config.table == "recipe":
+        rows = recipe.recipe(common)
+        rows = rows if options.rows else recipe.differing(rows, common)
+    else:
+        rows = variants.table1() if config.table == "table1" else variants.table2(common.network_config())
+    rows = variants.chosen(rows, options.rows)
+    configs = {variant.name: variant.of(common) for variant in rows}
+    variants.check_different(configs)
+    return configs, rows
+
+
+def _common(config: Any, shape: Literal["small", "base"]) -> TrainConfig:
+    """The training that all rows start from."""
+    options = config.tables
     common = TrainConfig(
         data=Path(config.data),
         out=Path(options.runs),
-        network=cast(Literal["small", "base"], shape),
+        network=shape,
         overrides=options.overrides,
         steps=options.steps,
         time_limit=options.time_limit,
@@ -97,13 +135,17 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
         device=config.device,
         threads=config.threads,
     )
-    common = with_settings(common, options.settings)
-    variants.check_different({"all": common})  # says so if an override does not exist
-    rows = variants.table1() if config.table == "table1" else variants.table2(common.network_config())
-    rows = variants.chosen(rows, options.rows)
-    configs = {variant.name: variant.of(common) for variant in rows}
-    variants.check_different(configs)
-    return configs, rows
+    return with_settings(common, options.settings)
+
+
+def _recipe(config: Any, rows: list[dict[str, Any]], configs: dict[str, TrainConfig]) -> list[str]:
+    """Adds to the rows what they change and what that did; the Markdown of them all."""
+    common = _common(config, next(iter(configs.values())).network)
+    for row in rows:
+        if row["row"] in configs:
+            row["changed"] = recipe.changes(configs[row["row"]], common)
+    recipe.judged(rows)
+    return [*means_table(rows, {"steps": "steps", "hours": "hours"}), "", recipe.NOTE, "", *recipe.summary(rows)]
 
 
 def _budget(config: Any) -> str:

@@ -13,8 +13,9 @@ from warpgarment import checkpoint, draw
 from warpgarment.body import BodyMotion
 from warpgarment.motion import GarmentMotion
 from warpgarment.simulator import Simulator
-from warpgarment.training.dataset import Sequence, list_sequences
+from warpgarment.training.dataset import Sequence
 from warpgarment.training.rollouts import predict
+from warpgarment.training.training_set import folders_of
 
 from .errors import DataLacks, OptionMissing
 from .meshing import remesh, surface_distance
@@ -48,9 +49,9 @@ def make(config: Any) -> dict[str, Any]:
         raise OptionMissing("figure7 needs --data FOLDER")
     path = checkpoint.find(config.network, device=config.device)
     simulator = Simulator(checkpoint.load(path), config.device)
-    folders = evenly(list_sequences(Path(config.data), split=config.split), config.max_sequences)
     rows: list[dict[str, Any]] = []
     skipped: dict[str, str] = {}
+    folders = evenly(folders_of(Path(config.data), config.split, skipped), config.max_sequences)
     drawn = results_file(config, "figure7_rollouts.png")
     for folder in tqdm(folders, desc="figure 7", unit="sequence"):
         try:

@@ -9,9 +9,10 @@ from typing import Any
 
 from warpgarment import checkpoint
 from warpgarment.simulator import Simulator
-from warpgarment.training.dataset import list_sequences, read_manifest
+from warpgarment.training.dataset import read_manifest
 from warpgarment.training.recipes import TRAINING_CUTS
 from warpgarment.training.set_manifest import read_set_manifest
+from warpgarment.training.training_set import folders_of
 
 from .errors import DataLacks, OptionMissing
 from .pictures import Keeper, bars, results_file, rollouts
@@ -49,8 +50,9 @@ def make(config: Any) -> dict[str, Any]:
     if config.data is None:
         raise OptionMissing(f"{config.table} needs --data FOLDER")
     title, find, note = TABLES[config.table]
-    groups = find(Path(config.data), config)
-    rows, skipped, keeper = [], {}, Keeper({group.folders[0].name for group in groups})
+    skipped: dict[str, str] = {}
+    groups = find(Path(config.data), config, skipped)
+    rows, left_out, keeper = [], dict[str, str](), Keeper({group.folders[0].name for group in groups})
     for place in (config.network, *config.tables.against):
         path = checkpoint.find(place, device=config.device)
         simulator = Simulator(checkpoint.load(path), config.device)
@@ -69,15 +71,22 @@ def make(config: Any) -> dict[str, Any]:
             names = {folder.name for folder in evenly(group.folders, config.max_sequences)}
             mine = [row for row in found.rows if row["sequence"] in names]
             if not mine:
-                reasons = "; ".join(f"{n}: {r}" for n, r in found.skipped.items() if n in names)
-                raise DataLacks(f"{config.data}: no sequence of {group.label!r} can be evaluated ({reasons})")
+                left_out[group.label] = "; ".join(f"{n}: {r}" for n, r in found.skipped.items() if n in names)
+                continue
             label = group.label + (f", {_label(path)}" if config.tables.against else "")
             rows.append(
                 {"row": group.name, "label": label, "seen": group.seen, "network": _label(path), "mean": means(mine)}
                 | {"count": len({row["sequence"] for row in mine}), "sequences": mine}
             )
+    if {row["seen"] for row in rows} != {True, False}:
+        reasons = "; ".join(f"{label}: {reason}" for label, reason in left_out.items())
+        raise DataLacks(f"{config.data}: too few groups can be evaluated to compare any ({reasons})")
     result = {"table": config.table, "title": title, "protocol": PROTOCOL, "rows": rows, "skipped": skipped}
+    result |= {"left_out": left_out}
     body = [note, "", PROTOCOL, "", *means_table(rows, {"count": "sequences"})]
+    body += [
+        line for label in left_out for line in ("", f"No row for {label}: none of its sequences can be evaluated.")
+    ]
     if config.picture:
         drawn = results_file(config, f"{config.table}_rollouts.png")
         if rollouts(drawn, keeper, [(group.label, group.folders[0].name) for group in groups]):
@@ -86,11 +95,10 @@ def make(config: Any) -> dict[str, Any]:
     return result
 
 
-def cuts(root: Path, config: Any) -> list[Group]:
+def cuts(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
     """Figure 9: the cuts trained on, on training and on unseen motions, and cuts never seen."""
-    manifests = _manifests(root, None)
-    numbers = {folder: (m.get("parameters") or {}).get("cut") for folder, m in manifests.items()}
-    cut = {folder: n for folder, n in numbers.items() if n is not None}
+    manifests = _manifests(root, None, skipped)
+    cut = {folder: n for folder, m in manifests.items() if (n := _cut(m)) is not None}
     trained = {n for folder, n in cut.items() if manifests[folder].get("split") == "train"}
 
     def those(split: str, seen: bool) -> list[Path]:
@@ -109,10 +117,10 @@ def cuts(root: Path, config: Any) -> list[Group]:
     return [group for group in groups if group.folders]
 
 
-def bodies(root: Path, config: Any) -> list[Group]:
+def bodies(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
     """Figure 12: bodies of kinds that no training sequence has, and those of kinds that some have."""
-    manifests = _manifests(root, config.split)
-    trained = {_kind(m) for m in _manifests(root, "train").values()}
+    manifests = _manifests(root, config.split, skipped)
+    trained = {_kind(m) for m in _manifests(root, "train", skipped).values()}
     kinds = {folder: _kind(m) for folder, m in manifests.items()}
     seen = [f for f, k in kinds.items() if k in trained]
     unseen = [f for f, k in kinds.items() if k not in trained]
@@ -123,22 +131,22 @@ def bodies(root: Path, config: Any) -> list[Group]:
             " `warpgarment generate --out DIR` tests on a mannequin and a creature"
         )
     groups = [Group("seen", f"bodies as trained on ({', '.join(sorted(trained))})", True, seen)]
-    worn = {manifests[f].get("category") for f in unseen}
-    same = [f for f in seen if manifests[f].get("category") in worn]
+    worn = {str(manifests[f].get("category")) for f in unseen}
+    same = [f for f in seen if str(manifests[f].get("category")) in worn]
     if same and len(same) < len(seen):
-        names = ", ".join(sorted(map(str, worn)))
+        names = ", ".join(sorted(worn))
         groups.append(Group("seen_same_categories", f"... in the categories below ({names})", True, same))
     for kind in sorted({kinds[f] for f in unseen}):
         groups.append(Group(kind, f"{kind}, never seen", False, [f for f in unseen if kinds[f] == kind]))
     return groups
 
 
-def categories(root: Path, config: Any) -> list[Group]:
+def categories(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
     """The unseen category: test sequences of categories held out, and of the others one by one and together."""
     held_out = tuple(config.tables.held_out) or _held_out(root)
-    manifests = _manifests(root, config.split)
+    manifests = _manifests(root, config.split, skipped)
     kinds = {folder: str(m.get("category")) for folder, m in manifests.items()}
-    trained = [str(m.get("category")) for m in _manifests(root, "train").values()]
+    trained = [str(m.get("category")) for m in _manifests(root, "train", skipped).values()]
     make_it = "`warpgarment generate --held-out skirt --out DIR` makes a set that tests on skirts only"
     if not held_out:
         raise DataLacks(f"{root}: no set.json says which categories are held out; give --held-out NAME. {make_it}")
@@ -160,8 +168,14 @@ def categories(root: Path, config: Any) -> list[Group]:
     return groups
 
 
-def _manifests(root: Path, split: str | None) -> Manifests:
-    return {folder: read_manifest(folder) for folder in list_sequences(root, split=split)}
+def _manifests(root: Path, split: str | None, skipped: dict[str, str]) -> Manifests:
+    return {folder: read_manifest(folder) for folder in folders_of(root, split, skipped)}
+
+
+def _cut(manifest: dict[str, Any]) -> int | None:
+    parameters = manifest.get("parameters")
+    cut = parameters.get("cut") if isinstance(parameters, dict) else None
+    return cut if isinstance(cut, int) else None
 
 
 def _kind(manifest: dict[str, Any]) -> str:
@@ -179,7 +193,7 @@ def _label(path: Path) -> str:
     return path.parent.name if path.stem in ("best", "network") else path.stem
 
 
-TABLES: dict[str, tuple[str, Callable[[Path, Any], list[Group]], str]] = {
+TABLES: dict[str, tuple[str, Callable[[Path, Any, dict[str, str]], list[Group]], str]] = {
     "figure9": (
         "Figure 9: seam cuts never seen",
         cuts,

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from warpgarment import checkpoint, demo, draw
 from warpgarment.simulator import Simulator
-from warpgarment.training.dataset import Sequence, list_sequences
+from warpgarment.training.dataset import Sequence
 from warpgarment.training.long_rollout import (
     STILL,
     Limits,
@@ -22,6 +22,7 @@ from warpgarment.training.long_rollout import (
     walk,
 )
 from warpgarment.training.rollouts import predict
+from warpgarment.training.training_set import folders_of
 
 from .errors import DataLacks, OptionMissing
 from .pictures import axes_of, save
@@ -66,7 +67,7 @@ def make(config: Any) -> dict[str, Any]:
     rows = [walked(simulator, name, options.long_frames) for name in tqdm(options.garments, desc="walk")]
     skipped: dict[str, str] = {}
     if config.data is not None:
-        folders = list_sequences(Path(config.data), split=config.split)
+        folders = folders_of(Path(config.data), config.split, skipped)
         found = []
         for folder in tqdm(evenly(folders, config.max_sequences or SEQUENCES), desc="sequences"):
             try:

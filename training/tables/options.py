@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-TableName = Literal["table1", "table2", "figure5", "figure7", "figure9", "figure12", "category", "long"]
+TableName = Literal["table1", "table2", "figure5", "figure7", "figure9", "figure12", "category", "long", "recipe"]
 
 RESULTS = Path("benchmarks/results")  # where tables go by default
 
@@ -16,9 +16,9 @@ class TableOptions:
     """What the tables need beside the options of every evaluation. Each table reads its own.
 
     Attributes:
-        runs: Of table1 and table2: the row `full` of table1 is trained in RUNS/table1/full. Runs that are complete are
-            not repeated, interrupted ones go on, and those made with other settings are refused.
-        rows: Only these rows of table1 or table2; none: all.
+        runs: Of table1, table2 and recipe: the row `full` of table1 is trained in RUNS/table1/full. Runs that are
+            complete are not repeated, interrupted ones go on, and those made with other settings are refused.
+        rows: Only these rows of table1, table2 or recipe; none: all.
         steps: Training steps of every row.
         time_limit: Instead of steps: minutes of training of every row.
         overrides: Network settings of every row, name=value.

@@ -24,6 +24,7 @@ from warpgarment.simulator import Simulator
 from warpgarment.training.baselines import rigid, skinned
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.rollouts import predict
+from warpgarment.training.training_set import reason_of
 
 METHODS = ("network", "skinned", "rigid")
 STARTS = ("warm", "cold")
@@ -94,8 +95,8 @@ def measure(
                 raise ValueError(f"{last + 1} frames, fewer than history + 1 = {history + 1}")
             if not np.isfinite(np.asarray(sequence.vertices)).all():
                 raise ValueError("recorded garment positions are not finite")
-        except (ValueError, OSError, KeyError, IndexError) as error:
-            result.skipped[Path(folder).name] = f"{type(error).__name__}: {error}"
+        except Exception as error:
+            result.skipped[Path(folder).name] = reason_of(error)
             continue
         for start in STARTS:
             newest = history - 1 if start == "warm" else 0
@@ -166,6 +167,14 @@ def evenly(folders: list[Path], most: int | None) -> list[Path]:
     if most is None or len(folders) <= most:
         return folders
     return [folders[(i * len(folders)) // most] for i in range(most)]
+
+
+def skipped_lines(skipped: dict[str, str]) -> list[str]:
+    """How many sequences were skipped, and why, as Markdown; nothing where none was."""
+    if not skipped:
+        return []
+    count = f"{len(skipped)} sequence{'s' if len(skipped) > 1 else ''} skipped:"
+    return [count, "", *(f"- {name}: {reason}" for name, reason in sorted(skipped.items()))]
 
 
 def plain(value: Any) -> Any:

@@ -15,7 +15,7 @@ from warpgarment.io.atomic import atomic_file
 from warpgarment.training.set_manifest import package_versions
 
 from .options import RESULTS
-from .protocol import FIGURES, STARTS, cells, plain
+from .protocol import FIGURES, STARTS, cells, plain, skipped_lines
 
 PROTOCOL = (
     "Warm: ten recorded frames, then free running. Cold: the first frame alone. Only predicted frames count. "
@@ -48,7 +48,8 @@ def publish(config: Any, result: dict[str, Any], body: list[str], draw: Callable
         with atomic_file(out / f"{name}.png") as temporary:
             draw(temporary)
     skipped = result.get("skipped", {})
-    lines += ["", *(f"Skipped {sequence}: {reason}" for sequence, reason in skipped.items())]
+    result["skipped_count"] = len(skipped)
+    lines += ["", *skipped_lines(skipped)]
     with atomic_file(out / f"{name}.json") as temporary:
         temporary.write_text(json.dumps(plain(result), indent=1, default=str), "utf-8")
     with atomic_file(out / f"{name}.md") as temporary:

@@ -16,8 +16,9 @@ from typing import Any
 from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
-from warpgarment.training.dataset import list_sequences, read_manifest
+from warpgarment.training.dataset import read_manifest
 from warpgarment.training.train import TrainConfig, train
+from warpgarment.training.training_set import folders_of
 
 from .settings import described, differences
 
@@ -36,11 +37,13 @@ class Run:
         file: The network, best in the validation rollouts.
         steps: That its training took.
         hours: That it took.
+        validation: Error of its best validation rollouts [cm]; None where there were none.
     """
 
     file: Path
     steps: int | None
     hours: float | None
+    validation: float | None = None
 
 
 def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
@@ -71,7 +74,7 @@ def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
             raise RunMismatch(f"{folder}: training stopped after {done} of {config.steps} steps; run it again")
     notes = _notes(folder / "network.safetensors")  # the last one: `file` may be of an earlier step
     record = wanted | {"complete": True, "file": Path(file).name, "sha256": _checksum(Path(file))}
-    record |= {"steps": notes.get("steps"), "hours": notes.get("hours")}
+    record |= {"steps": notes.get("steps"), "hours": notes.get("hours"), "validation": notes.get("rollout_error_cm")}
     _write(folder, record)
     return _complete(folder, record, config)
 
@@ -80,7 +83,7 @@ def identity(root: Path) -> dict[str, Any]:
     """What data a run was trained on: name, and the checksum of all that is trained or validated on."""
     digest, count = hashlib.sha256(), {}
     for split in ("train", "validation"):
-        folders = list_sequences(root, split=split)
+        folders = folders_of(root, split, {})  # as training does, which says what it skips
         count[split] = len(folders)
         for folder in folders:
             digest.update(json.dumps([split, folder.name, read_manifest(folder).get("checksums")]).encode())
@@ -106,7 +109,8 @@ def _complete(folder: Path, record: dict[str, Any], config: TrainConfig) -> Run:
     shape = asdict(checkpoint.read_metadata(file)[0])
     if shape != asdict(config.network_config()):
         raise RunMismatch(f"{file}: {'; '.join(differences(shape, asdict(config.network_config())))}")
-    return Run(file, record.get("steps"), record.get("hours"))
+    error = record.get("validation")  # the name of a number that is none, where all validation rollouts failed
+    return Run(file, record.get("steps"), record.get("hours"), error if isinstance(error, float) else None)
 
 
 def _read(folder: Path) -> dict[str, Any] | None:

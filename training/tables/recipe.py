@@ -1,0 +1,123 @@
+"""The rows of the table of the recipe: one training setting changed in each, and what that did.
+
+The recipe is the one that the options give. A row that would not differ from it, such as "without push-forward" of a
+recipe that has none, is left out unless it is asked for by name.
+
+The row `paper` is section 4.3.2 of the paper as far as it is printed: no residual, the world's heading, its encoder
+layers, one step of supervision, Gaussian noise on the normalised features and nothing else against drift. Its sigma_n
+is not published; `PAPER_NOISE` is ours. Heads and geodesic weights stay as given: tables 1 and 2 are about those.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from warpgarment.training.train import TrainConfig
+
+from .protocol import STARTS
+from .report import grid
+from .settings import described, differences
+from .variants import Variant
+
+AS_GIVEN = "as_given"
+PAPER_NOISE = 0.05  # standard deviations of the normalised features
+AGREE = 2.0 / 3.0  # share of rollouts that have to side with the means for a verdict
+SMALLEST = 0.01  # change of the mean error that counts, as a share
+NOTE = (
+    "Each row changes what it says, and nothing else. Validation: the best short cold rollouts in training, by which "
+    "the network was chosen. Better: rollouts whose error is below that of the recipe as given, of those that both "
+    "have. A change helps (or hurts) where the mean error falls (rises) by 1 % or more from both starts and two thirds "
+    "of the rollouts agree; otherwise it is open. One seed: what is open may be decided by more data or budget."
+)
+
+
+def recipe(common: TrainConfig) -> list[Variant]:
+    """The rows around a recipe, itself first."""
+    noise = common.noise
+
+    def displaced(factor: float) -> tuple[str, ...]:
+        return f"noise.position={noise.position * factor:.6g}", f"noise.offset={noise.offset * factor:.6g}"
+
+    shape = ("residual=false", "heading=world", "norm_first=false", "activation=relu")
+    plain = ("pushforward.share=0.0", "average=0.0", "augmentation.mirror=0.0", "augmentation.yaw=0.0")
+    gaussian = (*displaced(0.0), f"noise.features={noise.features or PAPER_NOISE!r}")
+    rows = [
+        Variant(AS_GIVEN, "as given"),
+        Variant("paper", "the paper's own", shape, (*plain, *gaussian)),
+        Variant("without_pushforward", "without push-forward", (), ("pushforward.share=0.0",)),
+        Variant("noise_none", "history not displaced", (), displaced(0.0)),
+        Variant("noise_third", "history displaced a third as far", (), displaced(1.0 / 3.0)),
+        Variant("noise_triple", "history displaced three times as far", (), displaced(3.0)),
+        Variant("lr_third", "a third of the learning rate", (), (f"lr={common.lr / 3.0:.6g}",)),
+        Variant("lr_triple", "three times the learning rate", (), (f"lr={common.lr * 3.0:.6g}",)),
+        Variant("without_average", "without weight average", (), ("average=0.0",)),
+        Variant(
+            "without_augmentation", "without mirror and yaw", (), ("augmentation.mirror=0.0", "augmentation.yaw=0.0")
+        ),
+        Variant("whole_garments", "whole garments throughout", (), ("splits=1",)),
+    ]
+    return rows
+
+
+def differing(rows: list[Variant], common: TrainConfig) -> list[Variant]:
+    """The rows that are not the recipe itself under another name."""
+    given = described(common)
+    return [row for row in rows if row.name == AS_GIVEN or described(row.of(common)) != given]
+
+
+def changes(config: TrainConfig, common: TrainConfig) -> str:
+    """What a row changes, in words."""
+    return "; ".join(differences(described(common), described(config))) or "nothing"
+
+
+def judged(rows: list[dict[str, Any]]) -> None:
+    """Adds to each row what its change did: `better` of `compared` rollouts, `change` of the mean error per start as a
+    share, and the `verdict`. Rows have `row`, `mean` and `sequences`; nothing is added where there is no row as given.
+    """
+    given = next((row for row in rows if row["row"] == AS_GIVEN), None)
+    if given is None:
+        return
+    errors = _errors(given)
+    for row in rows:
+        if row is given or "sequences" not in row:
+            continue
+        pairs = [(mine, errors[key]) for key, mine in _errors(row).items() if key in errors]
+        better = sum(mine < theirs for mine, theirs in pairs)
+        change = {
+            start: _mean_error(row, start) / _mean_error(given, start) - 1.0 for start in STARTS if start in row["mean"]
+        }
+        agreed = AGREE * len(pairs)
+        if pairs and all(c <= -SMALLEST for c in change.values()) and better >= agreed:
+            verdict = "helps"
+        elif pairs and all(c >= SMALLEST for c in change.values()) and len(pairs) - better >= agreed:
+            verdict = "hurts"
+        else:
+            verdict = "open"
+        row |= {"better": better, "compared": len(pairs), "change": change, "verdict": verdict}
+
+
+def summary(rows: list[dict[str, Any]]) -> list[str]:
+    """What each row changed and what that did; then which changes helped, which hurt, and which are open. Markdown."""
+    cells = []
+    for row in (row for row in rows if "changed" in row):
+        validation = "" if row["validation_cm"] is None else f"{row['validation_cm']:.2f}"
+        better = f"{row['better']} of {row['compared']}" if "better" in row else ""
+        cells.append([row["label"], row["changed"], validation, better, row.get("verdict", "")])
+    lines = [*grid(["", "changed", "validation [cm]", "better", "verdict"], cells), ""]
+    for verdict, heading in (("helps", "Helped"), ("hurts", "Hurt"), ("open", "Open")):
+        found = [
+            f"{row['label']} (" + ", ".join(f"{start} {c:+.1%}" for start, c in row["change"].items()) + ")"
+            for row in rows
+            if row.get("verdict") == verdict
+        ]
+        lines += [f"- {heading}: {'; '.join(found)}."] if found else []
+    return lines
+
+
+def _errors(row: dict[str, Any]) -> dict[tuple[str, str], float]:
+    """(sequence, start) -> error; infinite where a rollout failed."""
+    return {(s["sequence"], s["start"]): s["network"]["mean_vertex_error_cm"] for s in row["sequences"]}
+
+
+def _mean_error(row: dict[str, Any], start: str) -> float:
+    return row["mean"][start]["network"]["mean_vertex_error_cm"]
