@@ -64,14 +64,31 @@ class Factor(NamedTuple):
 
     @classmethod
     def build(
-        cls, matrix: scipy.sparse.csr_matrix, system: cg.System, *, explicit: bool, budget: int = BUDGET
+        cls,
+        matrix: scipy.sparse.csr_matrix,
+        system: cg.System,
+        *,
+        explicit: bool,
+        budget: int = BUDGET,
+        skip: np.ndarray | None = None,
     ) -> Factor:
-        """Factors the diagonal blocks of a symmetric matrix [V,V], positive definite each, while the budget lasts."""
+        """Factors the diagonal blocks of a symmetric matrix [V,V], positive definite each, while the budget lasts.
+
+        Args:
+            matrix: Float64. No entry joins two components.
+            system: Which vertices belong to a component.
+            explicit: The form of the factors.
+            budget: Entries of all factors together.
+            skip: Components that need no factor, bool [C].
+        """
         device = system.value.device
         bases, parts = [], []
         known: dict[tuple, int] = {}
         places = used = 0
-        for key, block in component_blocks(matrix, system):
+        for number, (key, block) in enumerate(component_blocks(matrix, system)):
+            if skip is not None and skip[number]:
+                bases.append(-1)
+                continue
             if key not in known:
                 known[key] = -1
                 part = _factored(block, explicit, (budget - used), device)

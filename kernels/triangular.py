@@ -34,45 +34,39 @@ def padded(v: wp.vec3d) -> wp.vec4d:
 
 
 @wp.func
-def eliminate(
+def eliminate_place(
     base: int,
     first: int,
-    size: int,
+    k: int,
     pivot: wp.array[wp.float64],
     pointer: wp.array[wp.int32],
     column: wp.array[wp.int32],
     value: wp.array[wp.float64],
     x: wp.array[wp.vec4d],
 ):
-    """x becomes D⁻¹ L⁻¹ x."""
-    e = pointer[base]
-    for k in range(size):
-        xk = x[first + k]
-        end = pointer[base + k + 1]
-        while e < end:
-            j = first + column[e]
-            x[j] = x[j] - value[e] * xk
-            e += 1
-        x[first + k] = pivot[base + k] * xk
+    """One place of the sweep upwards, after which x is D⁻¹ L⁻¹ x."""
+    xk = x[first + k]
+    for e in range(pointer[base + k], pointer[base + k + 1]):
+        j = first + column[e]
+        x[j] = x[j] - value[e] * xk
+    x[first + k] = pivot[base + k] * xk
 
 
 @wp.func
-def substitute_back(
+def substitute_place(
     base: int,
     first: int,
-    size: int,
+    k: int,
     pointer: wp.array[wp.int32],
     column: wp.array[wp.int32],
     value: wp.array[wp.float64],
     x: wp.array[wp.vec4d],
 ):
-    """x becomes L⁻ᵀ x."""
-    for m in range(size):
-        k = size - 1 - m
-        s = x[first + k]
-        for e in range(pointer[base + k], pointer[base + k + 1]):
-            s -= value[e] * x[first + column[e]]
-        x[first + k] = s
+    """One place of the sweep downwards, after which x is L⁻ᵀ x."""
+    s = x[first + k]
+    for e in range(pointer[base + k], pointer[base + k + 1]):
+        s -= value[e] * x[first + column[e]]
+    x[first + k] = s
 
 
 @wp.kernel(enable_backward=False)
@@ -101,9 +95,11 @@ def substitute(
         size = start[component + 1] - first
         for k in range(size):
             x[first + k] = padded(rhs[rows[first + order[b + k]]])
-        eliminate(b, first, size, pivot, pointer, column, value, x)
-        substitute_back(b, first, size, pointer, column, value, x)
         for k in range(size):
+            eliminate_place(b, first, k, pivot, pointer, column, value, x)
+        for m in range(size):
+            k = size - 1 - m
+            substitute_place(b, first, k, pointer, column, value, x)
             v = x[first + k]
             solution[rows[first + order[b + k]]] = wp.vec3d(v[0], v[1], v[2])
 
