@@ -10,14 +10,20 @@ import warp as wp
 from poison import poison_outputs
 from reference import collision as reference
 
-from warpgarment.kernels import collision, compliance
+from warpgarment.kernels import cg, collision, compliance
 from warpgarment.kernels.body_meshes import BodyMeshes
 
 EPSILON = 0.004
 TOLERANCE = 2e-5
 """0.02 mm: what is promised."""
-SOLVERS = {"forces": {}, "displacements": {"largest_compliance": 0}}
-"""Both ways to solve: through the inverse of B, and by conjugate gradients for the displacement."""
+SOLVERS = {
+    "wide": {},
+    "lanes": {"one_core": False},
+    "factor": {"largest_compliance": 0},
+    "displacements": {"largest_compliance": 0, "factor_budget": 0},
+}
+"""The ways to solve: for contact forces through the inverse of B as on a CPU and as on a GPU, or through a factor of B,
+and for the displacement by conjugate gradients."""
 
 
 @pytest.fixture(autouse=True)
@@ -123,38 +129,48 @@ def test_nothing_moves_without_contact(solver):
     assert (alone.iterations, alone.contacts) == (0, 0)
 
 
-def test_packed_batch_is_the_garments_one_by_one():
+@pytest.mark.parametrize("one_core", [True, False])
+def test_packed_batch_is_the_garments_one_by_one(one_core):
     """Garments of a batch that reach into each other, equal ones that share an inverse, or the wrong body.
 
-    The middle one is solved for displacements, the others for forces. The same to 1e-6 m: sums run in another order.
+    The middle one is too large for an inverse. The same to 1e-6 m: sums may run in another order.
     """
     small, large = meshes.skirt(24, 8, waist=0.17), meshes.skirt(30, 12, waist=0.17)
     rests, ellipsoids = [small, large, small], [ellipsoid(), ellipsoid(-0.06), ellipsoid(0.03)]
     options = [{}, {"largest_compliance": 0}, {}]
     alone = [
-        solver_for(rest, **option).refine(torch.tensor(moved(rest)), body_of(body))
+        solver_for(rest, one_core=one_core, **option).refine(torch.tensor(moved(rest)), body_of(body))
         for rest, body, option in zip(rests, ellipsoids, options, strict=True)
     ]
     vertex_offsets, face_offsets = meshes.offsets(*ellipsoids)
     joined = meshes.joined(*ellipsoids)
     bodies = BodyMeshes(torch.tensor(joined.vertices), torch.tensor(joined.faces), vertex_offsets, face_offsets)
     which = torch.tensor(np.repeat([0, 1, 2], [len(rest.vertices) for rest in rests]).astype(np.int32))
-    packed = solver_for(meshes.joined(*rests), largest_compliance=len(small.vertices))
-    assert len(packed._model[10]) == len(small.vertices) ** 2  # one inverse for the two equal skirts
-    result = packed.refine(torch.tensor(np.concatenate([moved(rest) for rest in rests])), bodies, which)
+    packed = solver_for(meshes.joined(*rests), largest_compliance=len(small.vertices), one_core=one_core)
+    assert inverted(packed) == [0, -1, 0]  # one inverse for the two equal skirts
+    vertices = torch.tensor(np.concatenate([moved(rest) for rest in rests]))
+    result = packed.refine(vertices, bodies, which)
     np.testing.assert_allclose(result, torch.cat(alone), atol=1e-6)
+    assert torch.equal(packed.refine(vertices, bodies, which), result)
 
 
-def test_budget_of_the_inverses_is_kept():
+def inverted(solver: collision.CollisionSolver) -> list[int]:
+    """Where the inverse of each component begins; -1 without one."""
+    return solver._model[len(cg.System._fields)].tolist()
+
+
+def test_budgets_are_kept():
     """A batch that allocates without a limit. Only the first of two different skirts fits; the result is the same."""
     first, second = meshes.skirt(24, 8, waist=0.17), meshes.skirt(22, 8, waist=0.16)
     both, count = meshes.joined(first, second), len(first.vertices)
-    solver = solver_for(both, compliance_budget=count**2)
-    assert len(solver._model[10]) == count**2
-    result = solver.refine(torch.tensor(both.vertices), body_of(ellipsoid()))
-    np.testing.assert_allclose(
-        result, solver_for(both).refine(torch.tensor(both.vertices), body_of(ellipsoid())), atol=TOLERANCE
-    )
+    entries = count * (-(-count // 16) * 16)
+    expected = solver_for(both).refine(torch.tensor(both.vertices), body_of(ellipsoid()))
+    for factors in (2**20, 0):
+        solver = solver_for(both, compliance_budget=entries, factor_budget=factors)
+        assert inverted(solver) == [0, -1]
+        assert len(solver._model[11]) == entries
+        result = solver.refine(torch.tensor(both.vertices), body_of(ellipsoid()))
+        np.testing.assert_allclose(result, expected, atol=TOLERANCE)
 
 
 def test_passes_repeat_detection_and_solve():
@@ -237,7 +253,7 @@ def test_operator_passes_opcheck():
     torch.library.opcheck(torch.ops.warpgarment.collision_solve, arguments)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", ["lanes", "displacements"])
 def test_many_lanes_give_the_same_result(monkeypatch, solver):
     """A missing barrier or a wrong stride, which one lane can't show. 256 lanes a block, as on a GPU."""
     rest, bodies = meshes.skirt(12, 4, waist=0.17), body_of(ellipsoid())

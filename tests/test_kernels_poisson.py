@@ -6,12 +6,13 @@ import igl
 import meshes
 import numpy as np
 import pytest
+import scipy.sparse as sparse
 import torch
 import warp as wp
 from poison import poison_outputs
 from reference import poisson as reference
 
-from warpgarment.kernels import cg, laplacian
+from warpgarment.kernels import cg, factor, laplacian
 from warpgarment.kernels.poisson import PoissonSolver
 
 GARMENTS = {
@@ -19,7 +20,10 @@ GARMENTS = {
     "obtuse": meshes.irregular_grid(24, 16, width=0.6, height=0.08),  # most angles far from 60°, some above 150°
     "strip": meshes.irregular_grid(200, 3, width=2.0, height=0.03),  # a band: small energies, large displacements
     "fine": meshes.skirt(40, 24),
+    "small": meshes.irregular_grid(5, 4),
 }
+SOLVERS = {"substitution": {}, "explicit": {"explicit": True}, "iterations": {"factor_budget": 0}}
+"""The ways to solve: by a factor as on a CPU, by its inverse as on a GPU, and by conjugate gradients without either."""
 
 
 @pytest.fixture(autouse=True)
@@ -79,16 +83,17 @@ def test_components_are_ordered_by_lowest_vertex():
     assert vertex.dtype == face.dtype == np.int32
 
 
+@pytest.mark.parametrize("way", SOLVERS)
 @pytest.mark.parametrize("scale", meshes.SCALES)
 @pytest.mark.parametrize("name", GARMENTS)
-def test_solution_is_the_direct_one(name, scale):
-    """A wrong right-hand side, or a solver that stops early or stagnates.
+def test_solution_is_the_direct_one(name, scale, way):
+    """A wrong right-hand side or factor, or a solver that stops early or stagnates.
 
     1e-5 of the bounding box is promised (of the smallest component's here); float32 output accounts for 2e-7 of it.
     """
     rest, _, phi, mean = problem(name, scale)
     exact = reference.solve(rest.vertices, rest.faces, phi, mean)
-    solver = solver_for(rest)
+    solver = solver_for(rest, **SOLVERS[way])
     wave = np.sin(9.0 * rest.vertices / diagonal(rest))
     guesses = {
         "rest": None,
@@ -121,11 +126,12 @@ def test_mean_of_face_centroids_is_set():
         np.testing.assert_allclose(result[rest.faces[piece == c]].mean((0, 1)), mean[c], atol=2e-7)
 
 
-def test_vertices_without_faces_stay():
+@pytest.mark.parametrize("way", SOLVERS)
+def test_vertices_without_faces_stay(way):
     """An empty row of the matrix that makes NaN, or moves with a mean that isn't its own."""
     rest, _, phi, mean = problem("skirt")
     loose = meshes.Mesh(np.concatenate([[[9, 9, 9]], rest.vertices, [[7, 8, 9]]]).astype(np.float32), rest.faces + 1)
-    solver = solver_for(loose)
+    solver = solver_for(loose, **SOLVERS[way])
     assert solver.component_count == 3
     means = np.concatenate([[[0, 0, 0]], mean, [[0, 0, 0]]]).astype(np.float32)
     initial = torch.tensor(loose.vertices) + 1.0
@@ -144,8 +150,9 @@ def test_no_faces_and_no_vertices():
     assert points.iterations == 0
 
 
+@pytest.mark.parametrize("way", SOLVERS)
 @pytest.mark.parametrize("scale", meshes.SCALES)
-def test_pins_are_soft_constraints(scale):
+def test_pins_are_soft_constraints(scale, way):
     """Pins with another stiffness than documented, or a component that follows both its pins and its mean.
 
     The skirt is pinned at its waist, at targets it can't reach; the sheet is free. 1e-5 of the bounding box.
@@ -153,22 +160,23 @@ def test_pins_are_soft_constraints(scale):
     rest, goal, phi, mean = problem("two_components", scale)
     pins = np.array([3, 0, 7, 8])
     targets = (goal[pins] + 0.1 * scale * np.random.default_rng(0).normal(size=(4, 3))).astype(np.float32)
-    solver = solver_for(rest, pins=torch.tensor(pins), pin_weight=2.0)
+    solver = solver_for(rest, pins=torch.tensor(pins), pin_weight=2.0, **SOLVERS[way])
     wrong_mean = mean + np.float32([[50.0, 0, 0], [0, 0, 0]]) * np.float32(scale)
     result = solver.solve(torch.tensor(phi), torch.tensor(wrong_mean), pin_targets=torch.tensor(targets)).numpy()
     exact = reference.solve(rest.vertices, rest.faces, phi, mean, pins, 2.0, targets)
     assert np.abs(result - exact).max() < 1e-5 * smallest_diagonal(rest)
 
 
-def test_packed_batch_is_the_garments_one_by_one():
+@pytest.mark.parametrize("way", SOLVERS)
+def test_packed_batch_is_the_garments_one_by_one(way):
     """Garments of a batch that reach into each other. Same arithmetic, so equal to the last bit."""
-    names = ["skirt", "tetrahedron", "irregular_grid"]
+    names = ["skirt", "tetrahedron", "irregular_grid", "tetrahedron"]
     rests, _, phis, means = zip(*(problem(name) for name in names), strict=True)
     alone = [
-        solver_for(rest).solve(torch.tensor(phi), torch.tensor(mean))
+        solver_for(rest, **SOLVERS[way]).solve(torch.tensor(phi), torch.tensor(mean))
         for rest, phi, mean in zip(rests, phis, means, strict=True)
     ]
-    packed = solver_for(meshes.joined(*rests)).solve(
+    packed = solver_for(meshes.joined(*rests), **SOLVERS[way]).solve(
         torch.tensor(np.concatenate(phis)), torch.tensor(np.concatenate(means))
     )
     assert torch.equal(packed, torch.cat(alone))
@@ -177,14 +185,15 @@ def test_packed_batch_is_the_garments_one_by_one():
 def test_a_good_guess_saves_iterations():
     """A solve for the vertices themselves, which stagnates, instead of for the increment."""
     rest, _, phi, mean = problem("fine")
-    solver = solver_for(rest)
+    solver = solver_for(rest, factor_budget=0)
     first = solver.solve(torch.tensor(phi), torch.tensor(mean))
     cold = solver.iterations
     solver.solve(torch.tensor(phi), torch.tensor(mean), initial=first)
     assert solver.iterations <= 2 * cg.WINDOW < cold
 
 
-def test_gradients_are_those_of_a_dense_solve():
+@pytest.mark.parametrize("way", SOLVERS)
+def test_gradients_are_those_of_a_dense_solve(way):
     """A wrong adjoint. Dense float64 torch solve, mean and pins as in the reference; 1e-5 of the largest entry."""
     rest, goal, phi, mean = problem("two_components")
     pins = np.array([0, 5, 9])
@@ -210,7 +219,7 @@ def test_gradients_are_those_of_a_dense_solve():
         result = function(*arguments)
         return result, torch.autograd.grad((result * weights.to(dtype)).sum(), arguments)
 
-    solver = solver_for(rest, pins=pins)
+    solver = solver_for(rest, pins=pins, **SOLVERS[way])
     ours, our_gradients = gradients(lambda p, m, t: solver.solve(p, m, pin_targets=t), torch.float32)
     theirs, their_gradients = gradients(dense, torch.float64)
     assert (ours - theirs).abs().max() < 1e-5 * diagonal(rest)
@@ -227,11 +236,12 @@ def test_operator_passes_opcheck():
     torch.library.opcheck(torch.ops.warpgarment.poisson_solve, (*arguments, initial, solver._model, 100))
 
 
-def test_many_lanes_give_the_same_result(monkeypatch):
+@pytest.mark.parametrize("way", SOLVERS)
+def test_many_lanes_give_the_same_result(monkeypatch, way):
     """A missing barrier or a wrong stride, which one lane can't show. 256 lanes a block, as on a GPU."""
-    rest, _, phi, mean = problem("two_components")
+    rest, _, phi, mean = problem("small" if way == "explicit" else "two_components")  # a block a row takes long
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", False)
-    solver = solver_for(rest, pins=[0, 1])
+    solver = solver_for(rest, pins=[0, 1], **SOLVERS[way])
     pins = torch.tensor(rest.vertices[[0, 1]])
     one = solver.solve(torch.tensor(phi), torch.tensor(mean), pin_targets=pins)
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
@@ -242,7 +252,7 @@ def test_many_lanes_give_the_same_result(monkeypatch):
 def test_reaching_the_limit_is_said_once():
     """An iteration that ends unconverged without a word, or one that warns every frame."""
     rest, _, phi, mean = problem("fine")
-    solver = solver_for(rest, max_iterations=9)
+    solver = solver_for(rest, max_iterations=9, factor_budget=0)
     with pytest.warns(RuntimeWarning, match="raise max_iterations"):
         solver.solve(torch.tensor(phi), torch.tensor(mean))
     assert solver.iterations == 9
@@ -251,11 +261,75 @@ def test_reaching_the_limit_is_said_once():
         solver.solve(torch.tensor(phi), torch.tensor(mean))
 
 
-def test_not_a_number_ends():
+@pytest.mark.parametrize("way", SOLVERS)
+def test_not_a_number_ends(way):
     """NaN in, and an iteration that never stops or a result that looks like one."""
     rest, _, phi, mean = problem("skirt")
     phi[4] = np.nan
-    assert not solver_for(rest).solve(torch.tensor(phi), torch.tensor(mean)).isfinite().any()
+    assert not solver_for(rest, **SOLVERS[way]).solve(torch.tensor(phi), torch.tensor(mean)).isfinite().any()
+
+
+@pytest.mark.parametrize("way", ["substitution", "explicit"])
+def test_budget_of_the_factors_is_kept(way):
+    """A batch that allocates without a limit. One of two skirts fits; the result is the same, and equal ones share."""
+    first, second = meshes.skirt(24, 8), meshes.skirt(22, 8)
+    alone = solver_for(first, **SOLVERS[way])
+    entries = sum(len(_factor(alone)[name]) for name in ("column", "row_column"))
+    both = meshes.joined(first, second, first)
+    solver = solver_for(both, factor_budget=entries, **SOLVERS[way])
+    assert sum(len(_factor(solver)[name]) for name in ("column", "row_column")) == entries
+    assert _factor(solver)["base"].tolist() == [0, -1, 0]
+    phi = torch.eye(3).expand(len(both.faces), 3, 3) * 1.1
+    mean = torch.zeros(3, 3)
+    expected = solver_for(both, factor_budget=0).solve(phi, mean)
+    np.testing.assert_allclose(solver.solve(phi, mean), expected, atol=1e-5 * smallest_diagonal(both))
+    assert solver.iterations > 0
+    assert alone.solve(phi[: len(first.faces)], mean[:1]).isfinite().all()
+    assert alone.iterations == 0
+
+
+def test_a_factor_that_cannot_be_trusted_is_not_used():
+    """Elimination that loses the solution of a nearly singular matrix, and garments that fly apart without a word."""
+    rest = meshes.irregular_grid(9, 7)
+    matrix = laplacian.cotangent_laplacian(rest.vertices, rest.faces)
+    count, largest = len(rest.vertices), matrix.diagonal().max()
+    system = cg.System.build(matrix, np.zeros(count, np.int32), 1, "cpu")
+
+    def factored(ground):
+        return factor.Factor.build((matrix + ground * sparse.identity(count)).tocsr(), system, explicit=False)
+
+    assert [factored(share * largest).base.tolist() for share in (1e-14, -1e-2, 1e-6)] == [[-1], [-1], [0]]
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_factor_is_that_of_the_matrix(flat):
+    """A wrong order, pivot or place. L D Lᵀ, or the inverse of W, is the permuted matrix to rounding.
+
+    The diagonals of a regular grid weigh nothing, so that entries of its L cancel.
+    """
+    rest = meshes.irregular_grid(9, 7)
+    x, y = np.meshgrid(np.arange(10.0), np.arange(8.0))
+    regular = np.stack([x, y, 0.0 * x], 2).reshape(-1, 3)
+    matrix = laplacian.cotangent_laplacian(regular if flat else rest.vertices, rest.faces)
+    count = len(rest.vertices)
+    matrix = (matrix + 0.1 * sparse.identity(count)).tocsr()
+    system = cg.System.build(matrix, np.zeros(count, np.int32), 1, "cpu")
+    for explicit in (False, True):
+        built = factor.Factor.build(matrix, system, explicit=explicit)
+        shape = {"shape": (count, count)}
+        lower = sparse.csc_matrix((built.value, built.column, built.pointer), **shape).toarray() + np.eye(count)
+        if explicit:
+            rows = sparse.csr_matrix((built.row_value, built.row_column, built.row_pointer), **shape).toarray()
+            np.testing.assert_array_equal(rows + np.eye(count), lower)
+            lower = np.linalg.inv(lower)
+        permuted = matrix.toarray()[built.order][:, built.order]
+        product = lower @ np.diag(1.0 / built.pivot.numpy()) @ lower.T
+        np.testing.assert_allclose(product, permuted, atol=1e-12 * np.abs(permuted).max())
+
+
+def _factor(solver: PoissonSolver) -> dict[str, torch.Tensor]:
+    fields = factor.Factor._fields
+    return dict(zip(fields, solver._model[-len(fields) :], strict=True))
 
 
 @pytest.mark.parametrize(
