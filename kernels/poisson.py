@@ -459,6 +459,14 @@ class PoissonSolver:
         """Iterations of the last solve, the largest of all components."""
         return self._progress.iterations
 
+    def summary(self) -> torch.Tensor:
+        """What the last solve says: iterations, components stopped by the limit, their largest error; not read."""
+        return self._progress.summary()
+
+    def tell(self, stopped: float, error: float) -> None:
+        """Warns, once, if a summary that was read from the device says that components were stopped."""
+        self._progress.tell(stopped, self.component_count, error)
+
     def solve(
         self,
         phi: torch.Tensor,
