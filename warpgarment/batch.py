@@ -168,11 +168,21 @@ def padded_views(
         face_splits: Disjoint subsets of faces per garment, each seen by the network alone: faces s, s+n, s+2n, ...
             Attention costs n times less, and a face no longer hears all others.
     """
+    groups = row_groups([len(garment.faces) for garment in garments], face_splits)
+    return [_view(packed, garments, config, face_splits, group) for group in groups]
+
+
+def row_groups(face_counts: Sequence[int], face_splits: int) -> list[list[tuple[int, int, int]]]:
+    """Which rows share a view, the longest first; each row is a garment's number, its first face, and how many faces.
+
+    Args:
+        face_counts: Faces of each garment.
+        face_splits: As `padded_views`.
+    """
     if face_splits < 1:
         raise ValueError(f"face_splits must be at least 1, got {face_splits}")
-    rows = []  # (garment, first face, faces)
-    for number, garment in enumerate(garments):
-        faces = len(garment.faces)
+    rows = []
+    for number, faces in enumerate(face_counts):
         rows += [(number, s, len(range(s, faces, face_splits))) for s in range(min(face_splits, faces))]
     rows.sort(key=lambda row: -row[2])
 
@@ -185,7 +195,7 @@ def padded_views(
                 groups[-1].append(row)
                 continue
         groups.append([row])
-    return [_view(packed, garments, config, face_splits, group) for group in groups]
+    return groups
 
 
 def _view(

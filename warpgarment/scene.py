@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from warpgarment import memory
 from warpgarment.batch import PackedBodies, PackedGarments, padded_views
 from warpgarment.errors import MeshError
 from warpgarment.frame_graph import GraphedFrames
@@ -52,6 +53,7 @@ class Scene:
 
     Raises:
         MeshError: A garment is more than 1 m from its body.
+        NotEnoughMemory: The batch would not fit on the device.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class Scene:
         self.collision_passes, self.half = collision_passes, half
         self.graph: GraphedFrames | None = None
         self.early_exit = device.type == "cpu"  # elsewhere it is cheaper to do a pass than to wait for the answer
+        memory.check(garments, bodies, network.config, face_splits=face_splits, half=half, device=device)
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
 

@@ -122,6 +122,7 @@ class Simulator:
         Raises:
             ValueError: Lists of different lengths, arrays of other shapes, both `first_vertices` and `history`.
             MeshError: A garment is more than 1 m from its body, or positions are not finite.
+            NotEnoughMemory: The batch would not fit on the device; names the setting with which it would.
         """
         garments, single = listed(garment, Garment)
         bodies = per_garment(body, BodyMotion, len(garments), "bodies")
@@ -184,7 +185,7 @@ class Simulator:
             The state at frame 0.
 
         Raises:
-            ValueError, MeshError: As `rollout`.
+            ValueError, MeshError, NotEnoughMemory: As `rollout`.
         """
         garments, single = listed(garment, Garment)
         if isinstance(body_vertices, (list, tuple)):
