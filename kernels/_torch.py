@@ -55,11 +55,14 @@ def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
 
 @contextlib.contextmanager
 def torch_stream(device: torch.device) -> Iterator[wp.Device]:
-    """Launches inside run on torch's current stream of the device. Yields the Warp device."""
+    """Launches inside run on torch's current stream of the device. Yields the Warp device.
+
+    Nothing is ever put on Warp's own stream, so there is nothing on it to wait for, which a graph capture would refuse.
+    """
     wp.init()  # at first use and not at import, so that importing never touches a driver
     warp_device = wp.device_from_torch(device)
     if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(device)):
+        with wp.ScopedStream(wp.stream_from_torch(device), sync_enter=False):
             yield warp_device
     else:
         yield warp_device

@@ -113,6 +113,14 @@ class CollisionSolver:
         """Iterations of the last refinement: the largest of all components, summed over the passes."""
         return self._progress.iterations
 
+    def summary(self) -> torch.Tensor:
+        """What the last refinement says: iterations, components stopped by the limit, their largest error; not read."""
+        return self._progress.summary()
+
+    def tell(self, stopped: float, error: float) -> None:
+        """Warns, once, if a summary that was read from the device says that components were stopped."""
+        self._progress.tell(stopped, self.component_count, error)
+
     @property
     def contacts(self) -> int:
         """Vertices closer than epsilon in the first pass of the last refinement."""

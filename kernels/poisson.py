@@ -149,6 +149,14 @@ class PoissonSolver:
         """Conjugate gradient iterations of the last solve, the largest of all components; 0 if all were direct."""
         return self._progress.iterations
 
+    def summary(self) -> torch.Tensor:
+        """What the last solve says: iterations, components stopped by the limit, their largest error; not read."""
+        return self._progress.summary()
+
+    def tell(self, stopped: float, error: float) -> None:
+        """Warns, once, if a summary that was read from the device says that components were stopped."""
+        self._progress.tell(stopped, self.component_count, error)
+
     def solve(
         self,
         phi: torch.Tensor,

@@ -6,9 +6,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import demo, draw, geodesics, metrics
+    from . import demo, draw, geodesics, memory, metrics
     from .body import BodyMotion
-    from .errors import CheckpointError, MeshError, MissingExtra
+    from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
     from .fitting import fit
     from .garment import Garment
     from .motion import GarmentMotion
@@ -25,6 +25,7 @@ __all__ = [
     "MeshError",
     "MissingExtra",
     "NetworkConfig",
+    "NotEnoughMemory",
     "RolloutStatus",
     "Simulator",
     "Verdict",
@@ -32,6 +33,7 @@ __all__ = [
     "draw",
     "fit",
     "geodesics",
+    "memory",
     "metrics",
 ]
 
@@ -45,6 +47,7 @@ _HOME = {
     "MeshError": "errors",
     "MissingExtra": "errors",
     "NetworkConfig": "network",
+    "NotEnoughMemory": "errors",
     "RolloutStatus": "status",
     "Simulator": "simulator",
     "Verdict": "status",

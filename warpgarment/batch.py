@@ -132,6 +132,8 @@ class PaddedView:
     component_mask: torch.Tensor | None  # bool [R,C]
     weights: torch.Tensor  # geodesic weights, [R,N,N] or [1,N,N]
     share: torch.Tensor  # [R], one over the number of rows of the same garment
+    real_faces: torch.Tensor | None  # int64, where face_mask is True in rows end to end; None where all are
+    real_components: torch.Tensor | None  # the same of component_mask
     in_order: bool  # the view is the packed batch itself, in one row
 
     def faces(self, packed: torch.Tensor) -> torch.Tensor:
@@ -148,15 +150,10 @@ class PaddedView:
         All rows of a garment say something of a component's velocity: their mean is taken, so it must start at zero.
         """
         for target, values in ((packed.psi, rows.psi), (packed.singular_values, rows.singular_values)):
-            if self.face_mask is None:
-                target[self.face_index.flatten()] = values.flatten(0, 1)
-            else:
-                target[self.face_index[self.face_mask]] = values[self.face_mask]
-        index, velocity = self.component_index.flatten(), (rows.velocity * self.share[:, None, None]).flatten(0, 1)
-        if self.component_mask is not None:
-            real = self.component_mask.flatten()
-            index, velocity = index[real], velocity[real]
-        packed.velocity.index_add_(0, index, velocity)
+            index, said = _those(self.real_faces, self.face_index, values)
+            target[index] = said
+        velocity = rows.velocity * self.share[:, None, None]
+        packed.velocity.index_add_(0, *_those(self.real_components, self.component_index, velocity))
 
 
 def padded_views(
@@ -171,11 +168,21 @@ def padded_views(
         face_splits: Disjoint subsets of faces per garment, each seen by the network alone: faces s, s+n, s+2n, ...
             Attention costs n times less, and a face no longer hears all others.
     """
+    groups = row_groups([len(garment.faces) for garment in garments], face_splits)
+    return [_view(packed, garments, config, face_splits, group) for group in groups]
+
+
+def row_groups(face_counts: Sequence[int], face_splits: int) -> list[list[tuple[int, int, int]]]:
+    """Which rows share a view, the longest first; each row is a garment's number, its first face, and how many faces.
+
+    Args:
+        face_counts: Faces of each garment.
+        face_splits: As `padded_views`.
+    """
     if face_splits < 1:
         raise ValueError(f"face_splits must be at least 1, got {face_splits}")
-    rows = []  # (garment, first face, faces)
-    for number, garment in enumerate(garments):
-        faces = len(garment.faces)
+    rows = []
+    for number, faces in enumerate(face_counts):
         rows += [(number, s, len(range(s, faces, face_splits))) for s in range(min(face_splits, faces))]
     rows.sort(key=lambda row: -row[2])
 
@@ -188,7 +195,7 @@ def padded_views(
                 groups[-1].append(row)
                 continue
         groups.append([row])
-    return [_view(packed, garments, config, face_splits, group) for group in groups]
+    return groups
 
 
 def _view(
@@ -223,6 +230,8 @@ def _view(
         component_index=torch.from_numpy(component_index.clip(min=0)).to(device),
         component_mask=_mask(component_index, device),
         weights=weights,
+        real_faces=_real(face_index, device),
+        real_components=_real(component_index, device),
         share=torch.tensor([1.0 / min(face_splits, len(garments[g].faces)) for g, _, _ in rows], device=device),
         in_order=packed.count == 1 and face_splits == 1,
     )
@@ -238,6 +247,18 @@ def _weights(
 def _mask(index: np.ndarray, device: torch.device) -> torch.Tensor | None:
     mask = index >= 0
     return None if mask.all() else torch.from_numpy(mask).to(device)
+
+
+def _real(index: np.ndarray, device: torch.device) -> torch.Tensor | None:
+    """Where a mask is True, found once: a GPU that is indexed by a mask makes the host wait for the number of rows."""
+    real = np.flatnonzero(index >= 0)
+    return None if len(real) == index.size else torch.from_numpy(real).to(device)
+
+
+def _those(real: torch.Tensor | None, *rows: torch.Tensor) -> list[torch.Tensor]:
+    """Tensors [R,N,...] with their rows end to end, and only the real ones of these; [M,...] each."""
+    flat = [tensor.flatten(0, 1) for tensor in rows]
+    return flat if real is None else [tensor[real] for tensor in flat]
 
 
 def _offsets(counts: Sequence[int]) -> tuple[int, ...]:

@@ -11,6 +11,10 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be read, is damaged, or belongs to another version."""
 
 
+class NotEnoughMemory(MemoryError):
+    """A batch that would not fit: says what needs how much, how much there is, and which setting makes it fit."""
+
+
 class MissingExtra(ImportError):
     """An optional package is not installed.
 

@@ -63,8 +63,8 @@ def feature_rotation(frame: torch.Tensor) -> torch.Tensor:
 
     Row-major matrices turn by Kronecker products: vec(G A) = (G x I) vec(A), vec(G A G^T) = (G x G) vec(A).
     """
-    turn = torch.eye(FEATURES).to(frame).repeat(len(frame), 1, 1)
-    identity = torch.eye(3).to(frame).expand_as(frame)
+    turn = torch.eye(FEATURES, dtype=frame.dtype, device=frame.device).repeat(len(frame), 1, 1)
+    identity = torch.eye(3, dtype=frame.dtype, device=frame.device).expand_as(frame)
     for name, right in (("deformation_gradient", identity), ("body_deformation", frame)):
         place = LAYOUT[name]
         turn[:, place, place] = torch.einsum("bij,bkl->bikjl", frame, right).reshape(-1, 9, 9)

@@ -91,7 +91,7 @@ def context(
     newest = face_features[..., -FEATURES:]
     deformation = newest[..., LAYOUT["body_deformation"]].detach()
     if face_mask is not None:  # a padded zero matrix has no rotation
-        deformation = torch.where(face_mask[..., None], deformation, torch.eye(3).to(deformation).flatten())
+        deformation = torch.where(face_mask[..., None], deformation, torch.eye(3, device=deformation.device).flatten())
     shape = deformation.shape[:-1]
     body_rotation = rotation(deformation.reshape(-1, 3, 3).contiguous()).reshape(*shape, 3, 3)
     velocity = component_mean(newest[..., LAYOUT["body_velocity"]], face_component, count, face_mask)

@@ -12,8 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from warpgarment import memory
 from warpgarment.batch import PackedBodies, PackedGarments, padded_views
 from warpgarment.errors import MeshError
+from warpgarment.frame_graph import GraphedFrames
 from warpgarment.garment import Garment
 from warpgarment.kernels.collision import CollisionSolver
 from warpgarment.kernels.deformation import face_centroids, inverse_rest_frames, replace_singular_values, segment_mean
@@ -51,6 +53,7 @@ class Scene:
 
     Raises:
         MeshError: A garment is more than 1 m from its body.
+        NotEnoughMemory: The batch would not fit on the device.
     """
 
     def __init__(
@@ -70,6 +73,9 @@ class Scene:
         device = body_vertices.device
         self.garments, self.network, self.timings = list(garments), network, timings
         self.collision_passes, self.half = collision_passes, half
+        self.graph: GraphedFrames | None = None
+        self.early_exit = device.type == "cpu"  # elsewhere it is cheaper to do a pass than to wait for the answer
+        memory.check(garments, bodies, network.config, face_splits=face_splits, half=half, device=device)
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
 
@@ -78,7 +84,7 @@ class Scene:
         self.body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
         self.body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
         self._bodies = BodyMeshes(body_vertices, bodies.faces, bodies.vertex_offsets, bodies.face_offsets)
-        self._placed = body_vertices
+        self.placed: torch.Tensor | None = body_vertices  # what the trees were last moved to
         self.refuse_far(first_vertices)
 
         self.views = padded_views(packed, garments, network.config, face_splits)
@@ -94,9 +100,9 @@ class Scene:
 
     def bodies(self, body_vertices: torch.Tensor) -> BodyMeshes:
         """The bodies' meshes with these vertices; moves them there if the last caller had them elsewhere."""
-        if self._placed is not body_vertices:
+        if self.placed is not body_vertices:
             self._bodies.update(body_vertices)
-            self._placed = body_vertices
+            self.placed = body_vertices
         return self._bodies
 
     def refuse_far(self, vertices: torch.Tensor) -> None:
@@ -173,7 +179,7 @@ class Scene:
             sound &= torch.isfinite(step.velocity).all(1)[packed.face_component.long()]
             finite = self.all_of(sound, packed.garment_of_face)
             kept = finite[packed.garment_of_face.long()]  # NaN of one garment must not reach a solver
-            psi = torch.where(kept[:, None, None], step.psi, torch.eye(3).to(phi))
+            psi = torch.where(kept[:, None, None], step.psi, torch.eye(3, device=phi.device))
             target = (psi @ phi).contiguous()
             if self.network.config.replace_singular_values:
                 stretch = torch.where(kept[:, None], step.singular_values, 1.0).clamp(min=SMALLEST_SINGULAR_VALUE)
@@ -195,8 +201,11 @@ class Scene:
 
     def push_out(
         self, vertices: torch.Tensor, next_body: torch.Tensor, finite: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Step 5: refines collisions, again for garments that are still deep and while it helps them.
+
+        Which garments these are is decided on the device. The others are on no body in a later pass, so their vertices
+        touch nothing and cost next to nothing; the CPU leaves out passes that no garment needs.
 
         Args:
             vertices: Positions [m], shape [V,3].
@@ -204,30 +213,42 @@ class Scene:
             finite: Which garments are still simulated, shape [B].
 
         Returns:
-            Positions [V,3], finite [B], depth of each garment's deepest vertex [m] [B], and iterations of all passes.
+            Positions [V,3], finite [B], depth of each garment's deepest vertex [m] [B], and what the solver says of all
+            passes: iterations, components stopped by the limit and their largest error, float64 [3].
         """
         with self.timings("collision"):
             bodies = self.bodies(next_body)
-            pending, depth, iterations = finite.clone(), None, 0
+            pending, depth, on_body = finite, None, self.body_of_vertex
+            solves = vertices.new_zeros(3, dtype=torch.float64)
             for _ in range(self.collision_passes):
-                refined = self.collision.refine(vertices, bodies, self.body_of_vertex, epsilon=self.epsilon)
-                iterations += self.collision.iterations
+                refined = self.collision.refine(vertices, bodies, on_body, epsilon=self.epsilon)
+                solves = _together(solves, self.collision.summary())
                 mine = pending[self.packed.garment_of_vertex.long()]
                 refined = torch.where(mine[:, None], refined, vertices)
                 vertices, finite = self.keep_finite(refined, vertices, finite)
-                before, depth = depth, self.depth(vertices, bodies)
-                pending = finite & (depth > SHALLOW)
+                before, depth = depth, self.depth(vertices, bodies, on_body)
                 if before is not None:
-                    pending &= depth < WORTHWHILE * before
-                if not pending.any():
+                    depth = torch.where(pending, depth, before)
+                    pending = depth < WORTHWHILE * before
+                pending = finite & pending & (depth > SHALLOW)
+                if self.early_exit and not pending.any():
                     break
+                on_body = torch.where(pending[self.packed.garment_of_vertex.long()], self.body_of_vertex, -1)
             if depth is None:
                 depth = self.depth(vertices, bodies)
-        return vertices, finite, depth, iterations
+        return vertices, finite, depth, solves
 
-    def depth(self, vertices: torch.Tensor, bodies: BodyMeshes) -> torch.Tensor:
-        """How deep the deepest vertex of each garment is in its body [m], at least 0; shape [B]."""
-        inside = -bodies.query(vertices, self.body_of_vertex).distance
+    def tell(self, solves: np.ndarray) -> None:
+        """Warns of solves that stopped at their limit; `solves` [2,3] as in `SimulationState`, read from the device."""
+        for solver, (_, stopped, error) in zip((self.poisson, self.collision), solves, strict=True):
+            solver.tell(stopped, error)
+
+    def depth(self, vertices: torch.Tensor, bodies: BodyMeshes, on_body: torch.Tensor | None = None) -> torch.Tensor:
+        """How deep the deepest vertex of each garment is in its body [m], at least 0; shape [B].
+
+        `on_body` [V] may leave garments out, whose depth is then NaN.
+        """
+        inside = -bodies.query(vertices, self.body_of_vertex if on_body is None else on_body).distance
         index = self.packed.garment_of_vertex.long()
         return inside.new_zeros(self.packed.count).scatter_reduce(0, index, inside, "amax")
 
@@ -253,6 +274,11 @@ def clearance(garment: Garment) -> float:
     i, j = garment.edges.T
     edge = float(np.linalg.norm(garment.vertices[i] - garment.vertices[j], axis=1).mean())
     return max(CLOSEST, CLEARANCE_PER_EDGE * edge)
+
+
+def _together(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """Two summaries of solves as one: iterations and stopped components add up, of errors the largest counts."""
+    return torch.cat([one[:2] + other[:2], torch.maximum(one[2:], other[2:])])
 
 
 def _lengths(offsets: Sequence[int]) -> list[int]:

@@ -6,6 +6,7 @@ and one garment is a batch of one.
 
 from __future__ import annotations
 
+import functools
 import os
 import warnings
 from collections.abc import Sequence
@@ -19,13 +20,14 @@ from warpgarment.arguments import as_array, counted, known_frames, listed, per_g
 from warpgarment.batch import PackedBodies
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
+from warpgarment.frame import READ_EVERY, Frame, Recording, advance
+from warpgarment.frame_graph import GraphedFrames
 from warpgarment.garment import Garment
 from warpgarment.history import History
 from warpgarment.motion import GarmentMotion
 from warpgarment.network import ManifoldAwareTransformer
 from warpgarment.scene import Scene
 from warpgarment.state import SimulationState
-from warpgarment.status import RolloutStatus
 from warpgarment.timing import Timings
 
 
@@ -40,6 +42,8 @@ class Simulator:
         collision_passes: Collision refinement is repeated while a vertex is more than 1 mm deep and it helps, at most
             so often per frame; 0 leaves it out.
         half: Run the transformer in bfloat16: faster on recent GPUs. Geometry stays in float32.
+        graph: Replay frames as one CUDA graph, after the first few (`frame_graph.py`). None: on CUDA, and a graph that
+            cannot be made is a RuntimeWarning. Off while `timings.synchronise` is set, which measures inside a frame.
 
     Attributes:
         timings: Seconds per stage since the simulator was made: a dict, plus `synchronise`, which must be set for it to
@@ -54,12 +58,16 @@ class Simulator:
         epsilon: float | None = None,
         collision_passes: int = 4,
         half: bool = False,
+        graph: bool | None = None,
     ) -> None:
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", torch.cuda.current_device())
         if (epsilon is not None and not epsilon >= 0.0) or collision_passes < 0:
             raise ValueError(f"epsilon and collision_passes must not be negative, got {epsilon} and {collision_passes}")
+        if graph and self.device.type != "cuda":
+            raise ValueError(f"graph=True needs a CUDA device, this is {self.device}; leave it out")
+        self.graph = self.device.type == "cuda" if graph is None else graph
         self.network = network.to(self.device)
         self.epsilon, self.collision_passes, self.half = epsilon, int(collision_passes), half
         self.timings = Timings(self.device)
@@ -114,6 +122,7 @@ class Simulator:
         Raises:
             ValueError: Lists of different lengths, arrays of other shapes, both `first_vertices` and `history`.
             MeshError: A garment is more than 1 m from its body, or positions are not finite.
+            NotEnoughMemory: The batch would not fit on the device; names the setting with which it would.
         """
         garments, single = listed(garment, Garment)
         bodies = per_garment(body, BodyMotion, len(garments), "bodies")
@@ -139,29 +148,19 @@ class Simulator:
         )
         first = [body_at(frame) for frame in range(given)]
         states = self._begin(garments, single, packed, known, first, face_splits)
-        total = max(lengths)
-        sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, garments, strict=True)]
-        positions = [np.full(size, np.nan, np.float32) for size in sizes]
-        statuses: list[list[RolloutStatus]] = [[] for _ in garments]
+        state, total = states[0], max(lengths)
+        recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         for frame in counted(range(total), progress):
-            if frame < given:
-                state = states[frame]
-            else:
-                state = self._advance(state, body_at(frame))
-            for i, (part, status) in enumerate(zip(state.split(), state.statuses(), strict=True)):
-                failed = statuses[i] and not statuses[i][-1].finite
-                if frame < lengths[i] and not failed:
-                    positions[i][frame] = part
-                    statuses[i].append(status)
-            if not state.finite.any():
+            state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
+            if not recording.add(state.now.outcome, last=frame == total - 1):
                 break
         results = []
-        for i, worn in enumerate(garments):
-            if not statuses[i][-1].finite:
+        for i, (worn, statuses) in enumerate(zip(garments, recording.statuses, strict=True)):
+            if not statuses[-1].finite:
                 label = worn.name or f"garment {i}"
-                warnings.warn(f"{label} stopped: {statuses[i][-1].message}", RuntimeWarning, stacklevel=2)
-            moved = positions[i][: len(statuses[i])]
-            results.append(GarmentMotion(moved, worn.faces, self.network.config.fps, statuses[i], worn.name))
+                warnings.warn(f"{label} stopped: {statuses[-1].message}", RuntimeWarning, stacklevel=2)
+            moved = recording.positions[i][: len(statuses)]
+            results.append(GarmentMotion(moved, worn.faces, self.network.config.fps, statuses, worn.name))
         return results[0] if single else results
 
     def start(
@@ -186,7 +185,7 @@ class Simulator:
             The state at frame 0.
 
         Raises:
-            ValueError, MeshError: As `rollout`.
+            ValueError, MeshError, NotEnoughMemory: As `rollout`.
         """
         garments, single = listed(garment, Garment)
         if isinstance(body_vertices, (list, tuple)):
@@ -221,10 +220,11 @@ class Simulator:
             MeshError: Positions that are not finite.
         """
         listed = isinstance(next_body_vertices, (list, tuple))
-        body = self._positions([as_array(v) for v in (next_body_vertices if listed else [next_body_vertices])])
-        if body.shape != state.body.shape:
-            raise ValueError(f"bodies had {len(state.body)} vertices at the start, now there are {len(body)}")
-        if not torch.isfinite(body).all():
+        arrays = [as_array(v) for v in (next_body_vertices if listed else [next_body_vertices])]
+        body = self._positions(arrays)
+        if body.shape != state.now.body.shape:
+            raise ValueError(f"bodies had {len(state.now.body)} vertices at the start, now there are {len(body)}")
+        if not all(np.isfinite(array).all() for array in arrays):
             raise MeshError(f"body_vertices of frame {state.frame + 1} hold NaN or infinity; skip or repair the frame")
         return self._advance(state, body)
 
@@ -254,46 +254,38 @@ class Simulator:
         history_length = self.network.config.history
         features = scene.features(known[0], body_frames[0], body_frames[0])
         history = History.cold(features, scene.packed.component_count, history_length)
+        if self.graph:
+            scene.graph = GraphedFrames(scene, functools.partial(advance, scene))
+        finite = torch.ones(len(garments), dtype=torch.bool, device=self.device)
+        unsolved = torch.zeros((2, 3), dtype=torch.float64, device=self.device)
         states = []
         for frame, (vertices, body) in enumerate(zip(known, body_frames, strict=True)):
             if frame:
                 features = scene.features(known[frame - 1], body_frames[frame - 1], body)
                 velocity = scene.components_mean(vertices) - scene.components_mean(known[frame - 1])
                 history = history.followed(history.stacked(features), velocity)
-            depth = scene.depth(vertices, scene.bodies(body)).cpu().numpy()
-            finite = np.ones(len(garments), dtype=bool)
-            states.append(SimulationState(scene, single, frame, vertices, body, history, finite, depth, 0, 0))
+            depth = scene.depth(vertices, scene.bodies(body))
+            now = Frame(vertices, body, history.features, history.velocities, finite, depth, unsolved)
+            states.append(SimulationState(scene, single, frame, now))
         return states
 
     @torch.inference_mode()
     def _advance(self, state: SimulationState, next_body: torch.Tensor) -> SimulationState:
-        """Algorithm 1: frame t, and the body at t+1, to frame t+1."""
-        scene, vertices = state.scene, state.positions
-        features = scene.features(vertices, state.body, next_body)
-        stacked = state.history.stacked(features)
-        step = scene.predict(stacked, state.history.velocities)
-        solved, finite = scene.reconstruct(vertices, step, features, next_body)
-        finite = finite & torch.from_numpy(state.finite).to(finite.device)
-        poisson_iterations = scene.poisson.iterations
-        committed, finite, depth, collision_iterations = scene.push_out(solved, next_body, finite)
-        velocity = scene.components_mean(committed) - scene.components_mean(vertices)
-        return SimulationState(
-            scene=scene,
-            single=state.single,
-            frame=state.frame + 1,
-            positions=committed,
-            body=next_body,
-            history=state.history.followed(stacked, velocity),
-            finite=finite.cpu().numpy(),
-            depth=depth.cpu().numpy(),
-            poisson_iterations=poisson_iterations,
-            collision_iterations=collision_iterations,
-        )
+        scene = state.scene
+        if scene.graph is None or self.timings.synchronise:
+            after = advance(scene, state.now, next_body)
+        else:
+            after = scene.graph(state.now, next_body)
+        return SimulationState(scene, state.single, state.frame + 1, after)
 
     def _known(self, garments: list[Garment], single: bool, first: Any, history: Any) -> torch.Tensor:
         frames = known_frames(garments, single, first, history, self.network.config.history)
         return torch.from_numpy(frames).to(self.device)
 
     def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
-        """Arrays [*,3] end to end on the device; always a copy, so that callers may reuse theirs."""
-        return torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False)).to(self.device)
+        """Arrays [*,3] end to end on the device; always a copy, so that callers may reuse theirs.
+
+        Pinned on the way to a GPU: from other memory the host would wait until all earlier work is done.
+        """
+        packed = torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False))
+        return packed.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else packed
