@@ -7,7 +7,7 @@ from pygeodesic.geodesic import PyGeodesicAlgorithmExact
 from scipy.spatial import Delaunay
 
 import warpgarment as wg
-from warpgarment.geodesics import face_geodesics
+from warpgarment.geodesics import face_geodesics, local_geodesics
 
 
 def sheet(columns, rows, wrap=False):
@@ -107,6 +107,54 @@ def test_within_two_percent_of_exact_distances(name):
     ratio = distances[sources][others] / exact[others]
     assert ratio.min() > 1 - 1e-6
     assert ratio.max() < 1.02
+
+
+@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize("share", [0.2, np.inf])
+def test_local_distances_are_the_dense_ones_up_to_the_radius(name, share):
+    """A pair near the cut-off would be lost, or its path cut short by the border of its block.
+
+    The radius lies between two distances, so that no rounding decides. Values may differ in the last bit (relative
+    1.2e-7), since the dense matrix takes the smaller of the sums from both ends.
+    """
+    vertices, faces = MESHES[name]()
+    dense = face_geodesics(vertices, faces)
+    levels = np.unique(dense[np.isfinite(dense)].round(6))
+    radius = np.inf
+    if share < 1:
+        start = int(share * len(levels))
+        gap = start + np.argmax(np.diff(levels[start : start + 50]))
+        radius = float(levels[gap : gap + 2].mean())
+    local = local_geodesics(vertices, faces, radius)
+    assert local.dtype == np.float32
+    assert local.has_sorted_indices
+    stored = np.zeros(dense.shape, bool)
+    row = np.repeat(np.arange(len(faces)), np.diff(local.indptr))
+    stored[row, local.indices] = True
+    np.testing.assert_array_equal(stored, dense <= radius)
+    found = local.toarray()
+    np.testing.assert_array_equal(found, found.T)
+    np.testing.assert_allclose(found[stored], dense[stored], rtol=1.2e-7)
+    np.testing.assert_array_equal(np.diag(found), 0)
+
+
+def test_blocks_of_local_distances_make_no_difference(monkeypatch):
+    """A block's surroundings would be too small for the shortest paths of its faces."""
+    vertices, faces = skirt(24, 4, None, 0.05)
+    whole = local_geodesics(vertices, faces, 0.3)
+    monkeypatch.setattr("warpgarment.geodesics.BLOCK", 7)
+    np.testing.assert_allclose(local_geodesics(vertices, faces, 0.3).toarray(), whole.toarray(), rtol=1e-6)
+
+
+def test_local_distances_refuse_a_bad_radius_and_too_many_pairs(monkeypatch):
+    """An infinite radius on a large garment would fill the memory without a word."""
+    vertices, faces = flat(4, 4)
+    for radius in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="radius must be positive"):
+            local_geodesics(vertices, faces, radius)
+    monkeypatch.setattr("warpgarment.geodesics.MEMORY_BUDGET", 4000)
+    with pytest.raises(wg.MeshError, match="lower the radius"):
+        local_geodesics(vertices, faces, 10.0)
 
 
 def test_flat_neighbours_are_straight():

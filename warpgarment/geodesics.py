@@ -8,12 +8,15 @@ the angles around a vertex sum to more than 2π (Mitchell, Mount and Papadimitri
    neighbourhood.
 2. Chain these segments with Dijkstra's algorithm.
 
+`face_geodesics` does this for all pairs, `local_geodesics` for pairs within a radius, without a matrix of F x F.
+
 With strips of unlimited length this is exact. They end at `REACH` times the source's own size, so a long straight
 segment becomes a chain of seen centroids that lie almost on it: distances are never too short, and a little too long.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -28,6 +31,7 @@ CROSSED_REACH = 1.5  # or this many times the longest edge of any face crossed, 
 LEAST_DEPTH = 4  # but not before they have crossed this many faces,
 DEPTH = 400  # and in any case after this many
 SADDLE = 1e-3  # angle beyond 2 pi from which a vertex can bend a shortest path [rad]
+BLOCK = 512  # sources of one search of local distances
 MEMORY_BUDGET = 8 * 2**30  # bytes of float32 distances that are still computed: about 46,000 faces
 
 
@@ -46,22 +50,101 @@ def face_geodesics(rest_vertices: Any, faces: Any) -> np.ndarray:
         MeshError: Bad shapes or indices, positions that are not finite, non-manifold edges, faces without area, or a
             matrix beyond `MEMORY_BUDGET`.
     """
-    vertices = checked_positions(rest_vertices, name="rest_vertices")
-    faces = checked_faces(faces, len(vertices))
+    vertices, faces = _checked(rest_vertices, faces)
     need = 4 * len(faces) ** 2
     if need > MEMORY_BUDGET:
         raise MeshError(
             f"Distances between {len(faces):,} faces need {need / 2**30:.0f} GiB, more than "
             f"{MEMORY_BUDGET / 2**30:.0f}. Coarsen the garment, or raise warpgarment.geodesics.MEMORY_BUDGET."
         )
-    complain(repeated_vertices(faces) | no_area(vertices, faces), "faces", "have no area", "Run garment.cleaned().")
-    check_edges(faces)
     distances = distances_from(surface_graph(vertices, faces), np.arange(len(faces)), len(faces))
     np.minimum(
         distances, distances.T, out=distances
     )  # the same path summed from its other end may differ in the last bit
     np.fill_diagonal(distances, 0.0)
     return distances
+
+
+def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix:
+    """Distances over the surface between face centroids no further apart than a radius, a row per face.
+
+    A path no longer than the radius stays in the ball of that radius around its start. So sources are taken in blocks
+    of neighbours, and Dijkstra's algorithm sees only the part of the graph around a block: time and memory grow with
+    the number of pairs found.
+
+    Args:
+        rest_vertices: Positions [m], shape [V,3]; NumPy or torch.
+        faces: Vertex indices of an oriented manifold mesh, shape [F,3].
+        radius: Longest distance kept [m], positive; `inf` keeps all of the same component.
+
+    Returns:
+        Distances [m], float32, shape [F,F], symmetric, columns sorted. The diagonal is stored, as zeros; pairs further
+        apart are not stored. Stored values are those of `face_geodesics`, to the last bit but one.
+
+    Raises:
+        MeshError: As `face_geodesics`; pairs beyond `MEMORY_BUDGET`.
+        ValueError: A radius that is not positive.
+    """
+    if not radius > 0.0:
+        raise ValueError(f"radius must be positive, got {radius}")
+    vertices, faces = _checked(rest_vertices, faces)
+    mesh = _Unfolding(vertices.astype(np.float64), faces.astype(np.int64))
+    graph, count = _segments(mesh), len(faces)
+    nodes = np.concatenate([vertices[faces].mean(axis=1), vertices[mesh.node_of_vertex >= 0]]).astype(np.float64)
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    stored = 0
+    for block in _neighbourhoods(nodes[:count]):
+        low, high = nodes[block].min(axis=0) - 1.001 * radius, nodes[block].max(axis=0) + 1.001 * radius
+        inside = np.nonzero(((nodes >= low) & (nodes <= high)).all(axis=1))[0]
+        part = dijkstra(
+            graph[inside][:, inside], indices=np.searchsorted(inside, block), limit=radius * (1 + 1e-6)
+        )  # rounded to float32 before they are compared, so that ties end as they do in the dense matrix
+        part = part[:, : np.searchsorted(inside, count)].astype(np.float32)
+        row, column = np.nonzero((part <= radius) & (part < np.inf) & (block[:, None] < inside[: part.shape[1]]))
+        found.append((block[row], inside[column], part[row, column]))
+        stored += 2 * len(row)
+        if 8 * stored > MEMORY_BUDGET:
+            raise MeshError(
+                f"Distances up to {radius:g} m between {count:,} faces need more than {MEMORY_BUDGET / 2**30:.0f} GiB. "
+                "Coarsen the garment, lower the radius, or raise warpgarment.geodesics.MEMORY_BUDGET."
+            )
+    source, target, length = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    upper_half = csr_matrix((length, (source, target)), shape=(count, count))
+    diagonal = csr_matrix((np.zeros(count, np.float32), np.arange(count), np.arange(count + 1)), shape=(count, count))
+    return _stacked(upper_half, diagonal)
+
+
+def _stacked(upper: csr_matrix, diagonal: csr_matrix) -> csr_matrix:
+    """The lower half, the diagonal and the upper half; a sum of matrices would drop the zeros."""
+    count = upper.shape[0]
+    parts = [upper.T.tocsr(), diagonal, upper]
+    row = np.concatenate([np.repeat(np.arange(count, dtype=np.int32), np.diff(part.indptr)) for part in parts])
+    indices = np.concatenate([part.indices for part in parts])
+    data = np.concatenate([part.data for part in parts])
+    result = csr_matrix((data, (row, indices)), shape=(count, count))
+    result.sort_indices()
+    return result
+
+
+def _neighbourhoods(points: np.ndarray) -> Iterator[np.ndarray]:
+    """Indices of points in blocks of neighbours, by halving along the longest side of the bounding box."""
+    waiting = [np.arange(len(points))]
+    while waiting:
+        block = waiting.pop()
+        if len(block) <= BLOCK:
+            yield np.sort(block)
+            continue
+        axis = np.ptp(points[block], axis=0).argmax()
+        order = block[np.argsort(points[block, axis], kind="stable")]
+        waiting += [order[len(order) // 2 :], order[: len(order) // 2]]
+
+
+def _checked(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    vertices = checked_positions(rest_vertices, name="rest_vertices")
+    faces = checked_faces(faces, len(vertices))
+    complain(repeated_vertices(faces) | no_area(vertices, faces), "faces", "have no area", "Run garment.cleaned().")
+    check_edges(faces)
+    return vertices, faces
 
 
 def distances_from(graph: csr_matrix, sources: np.ndarray, face_count: int) -> np.ndarray:
@@ -84,7 +167,10 @@ def surface_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
     Returns:
         Symmetric weights [m], float64, shape [F+K, F+K].
     """
-    mesh = _Unfolding(vertices.astype(np.float64), faces.astype(np.int64))
+    return _segments(_Unfolding(vertices.astype(np.float64), faces.astype(np.int64)))
+
+
+def _segments(mesh: _Unfolding) -> csr_matrix:
     seen = [mesh.spread(mesh.from_centroids()), mesh.spread(mesh.from_vertices()), mesh.over_midpoints()]
     source, target, length = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     rows, cols = np.concatenate([source, target]), np.concatenate([target, source])
