@@ -170,7 +170,7 @@ class CollisionSolver:
             raise ValueError(f"passes must be at least 1, got {passes}")
         limit = torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
         for number in range(passes):
-            query = bodies.query(vertices.detach(), body_of_vertex)
+            query = bodies.query(vertices.detach(), body_of_vertex, within=epsilon)
             closest, normal = contacts(vertices, query.distance, query.face, bodies, math.inf if each else epsilon)
             if isinstance(epsilon, torch.Tensor):  # n.(V - U) - e = n.(V - (U + e n)), so the solver's epsilon is zero
                 normal = torch.where((query.distance < epsilon)[:, None], normal, 0.0)

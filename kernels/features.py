@@ -1,4 +1,7 @@
-"""What the network sees of a face: 34 numbers per face and frame, in one launch; and its nearest body face, in another.
+"""What the network sees of a face: 34 numbers per face and frame.
+
+`frame_features` is one launch for all faces of all garments; `body_interaction` and `face_features` are its two halves,
+for who keeps the first and differentiates the second.
 
 Manifold-aware transformers, section 4.2 and, for their order, f_i in section 4.3.
 
@@ -23,11 +26,11 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from ._operator import row_operator
-from ._torch import expect
-from .body_meshes import BodyMeshes, closest_on_body
+from ._operator import allocate, row_operator
+from ._torch import as_warp, expect, torch_stream
+from .body_meshes import MAX_DISTANCE, Bodies, BodyMeshes, closest_on_body
 from .deformation import corners_exist, expect_mesh, face_frame
-from .singular_values import singular_values_of
+from .singular_values import frame_singular_values
 
 LAYOUT: dict[str, slice] = {
     "deformation_gradient": slice(0, 9),
@@ -78,16 +81,38 @@ def frame_or_zero(a: wp.vec3, b: wp.vec3, c: wp.vec3):
     return wp.matrix_from_cols(e1, e2, wp.normalize(area))
 
 
+@wp.func
+def nearest_motion(bodies: Bodies, b: int, point: wp.vec3, next_vertices: wp.array[wp.vec3]):
+    """The fields of `BodyInteraction` of one point."""
+    closest = wp.vec3(wp.nan)
+    sign = wp.float32(1.0)
+    face = wp.int32(-1)
+    deformation = wp.identity(n=3, dtype=wp.float32)
+    velocity = wp.vec3(0.0)
+    if b >= 0 and b < bodies.meshes.shape[0]:
+        found, side, _weights, position = closest_on_body(bodies, b, point, MAX_DISTANCE)
+        if found >= 0:
+            closest = wp.vec3(position)
+            sign = side
+            face = found + bodies.face_offsets[b]
+            corner = bodies.faces[face]
+            a0, a1, a2 = bodies.vertices[corner[0]], bodies.vertices[corner[1]], bodies.vertices[corner[2]]
+            b0, b1, b2 = next_vertices[corner[0]], next_vertices[corner[1]], next_vertices[corner[2]]
+            velocity = ((b0 - a0) + (b1 - a1) + (b2 - a2)) / 3.0
+            q = frame_or_zero(a0, a1, a2)
+            q_next = frame_or_zero(b0, b1, b2)
+            if wp.determinant(q) > wp.float64(0.0) and wp.determinant(q_next) > wp.float64(0.0):
+                deformation = wp.mat33(q_next * wp.inverse(q))
+    return closest, sign, face, deformation, velocity
+
+
 @wp.kernel(enable_backward=False)
 def body_interaction_kernel(
     # Model:
-    meshes: wp.array[wp.uint64],
-    face_offsets: wp.array[wp.int32],
-    body_faces: wp.array[wp.vec3i],
+    bodies: Bodies,
     # In:
     centroids: wp.array[wp.vec3],
     body_of_face: wp.array[wp.int32],
-    body_vertices: wp.array[wp.vec3],
     next_vertices: wp.array[wp.vec3],
     # Out:
     closest: wp.array[wp.vec3],
@@ -97,30 +122,50 @@ def body_interaction_kernel(
     velocity: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    b = body_of_face[i]
-    closest[i] = wp.vec3(wp.nan)
-    sign[i] = 1.0
-    face[i] = -1
-    deformation[i] = wp.identity(n=3, dtype=wp.float32)
-    velocity[i] = wp.vec3(0.0)
-    if b < 0 or b >= meshes.shape[0]:
-        return
-    found, side, _weights, position = closest_on_body(meshes[b], centroids[i])
-    if found < 0:
-        return
-    found += face_offsets[b]
-    closest[i] = wp.vec3(position)
-    sign[i] = side
-    face[i] = found
+    c, s, f, d, v = nearest_motion(bodies, body_of_face[i], centroids[i], next_vertices)
+    closest[i] = c
+    sign[i] = s
+    face[i] = f
+    deformation[i] = d
+    velocity[i] = v
 
-    corner = body_faces[found]
-    a0, a1, a2 = body_vertices[corner[0]], body_vertices[corner[1]], body_vertices[corner[2]]
-    b0, b1, b2 = next_vertices[corner[0]], next_vertices[corner[1]], next_vertices[corner[2]]
-    velocity[i] = ((b0 - a0) + (b1 - a1) + (b2 - a2)) / 3.0
-    q = frame_or_zero(a0, a1, a2)
-    q_next = frame_or_zero(b0, b1, b2)
-    if wp.determinant(q) > wp.float64(0.0) and wp.determinant(q_next) > wp.float64(0.0):
-        deformation[i] = wp.mat33(q_next * wp.inverse(q))
+
+@wp.func
+def write_features(
+    features: wp.array2d[wp.float32],
+    i: int,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    inverse_rest: wp.mat33,
+    mean: wp.vec3,
+    closest: wp.vec3,
+    sign: float,
+    body_deformation: wp.mat33,
+    body_velocity: wp.vec3,
+):
+    """Row i of the features, for the face with corners a, b, c."""
+    q = face_frame(a, b, c)
+    phi = q * inverse_rest
+    s = frame_singular_values(q, inverse_rest)
+    z = (a + b + c) / 3.0
+
+    to_body = closest - z
+    distance = wp.length(to_body)
+    direction = wp.vec3(0.0)
+    if not distance < TOUCHING:
+        direction = to_body / distance
+
+    for row in range(3):
+        for column in range(3):
+            features[i, 3 * row + column] = phi[row, column]
+            features[i, 19 + 3 * row + column] = body_deformation[row, column]
+        features[i, 9 + row] = q[row, 2]
+        features[i, 12 + row] = z[row] - mean[row]
+        features[i, 16 + row] = direction[row]
+        features[i, 28 + row] = body_velocity[row]
+        features[i, 31 + row] = s[row]
+    features[i, 15] = sign * distance
 
 
 @wp.kernel
@@ -146,51 +191,42 @@ def face_features_kernel(
             features[i, k] = wp.nan
         return
     a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
-    q = face_frame(a, b, c)
-    phi = q * inverse_rest[i]
-    s = singular_values_of(phi)
-    z = (a + b + c) / 3.0
     mean = garment_mean[garment]
-
-    to_body = closest[i] - z
-    distance = wp.length(to_body)
-    direction = wp.vec3(0.0)
-    if not distance < TOUCHING:
-        direction = to_body / distance
-
-    for row in range(3):
-        for column in range(3):
-            features[i, 3 * row + column] = phi[row, column]
-            features[i, 19 + 3 * row + column] = body_deformation[i][row, column]
-        features[i, 9 + row] = q[row, 2]
-        features[i, 12 + row] = z[row] - mean[row]
-        features[i, 16 + row] = direction[row]
-        features[i, 28 + row] = body_velocity[i][row]
-        features[i, 31 + row] = s[row]
-    features[i, 15] = sign[i] * distance
+    write_features(
+        features, i, a, b, c, inverse_rest[i], mean, closest[i], sign[i], body_deformation[i], body_velocity[i]
+    )
 
 
-_body_interaction = row_operator(
-    "body_interaction",
-    body_interaction_kernel,
-    {
-        "meshes": wp.uint64,
-        "face_offsets": wp.int32,
-        "body_faces": wp.vec3i,
-        "centroids": wp.vec3,
-        "body_of_face": wp.int32,
-        "body_vertices": wp.vec3,
-        "next_vertices": wp.vec3,
-    },
-    {
-        "closest": (wp.vec3, (3,)),
-        "sign": (wp.float32, ()),
-        "face": (wp.int32, ()),
-        "deformation": (wp.mat33, (3, 3)),
-        "velocity": (wp.vec3, (3,)),
-    },
-    rows="centroids",
-)
+@wp.kernel(enable_backward=False)
+def frame_features_kernel(
+    # Model:
+    bodies: Bodies,
+    inverse_rest: wp.array[wp.mat33],
+    faces: wp.array[wp.vec3i],
+    garment_of_face: wp.array[wp.int32],
+    body_of_face: wp.array[wp.int32],
+    # In:
+    vertices: wp.array[wp.vec3],
+    garment_mean: wp.array[wp.vec3],
+    next_vertices: wp.array[wp.vec3],
+    # Out:
+    features: wp.array2d[wp.float32],
+):
+    i = wp.tid()
+    face = faces[i]
+    garment = garment_of_face[i]
+    if not corners_exist(face, vertices.shape[0]) or garment < 0 or garment >= garment_mean.shape[0]:
+        for k in range(wp.static(FEATURES)):
+            features[i, k] = wp.nan
+        return
+    a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
+    closest, sign, _face, deformation, velocity = nearest_motion(
+        bodies, body_of_face[i], (a + b + c) / 3.0, next_vertices
+    )
+    mean = garment_mean[garment]
+    write_features(features, i, a, b, c, inverse_rest[i], mean, closest, sign, deformation, velocity)
+
+
 _face_features = row_operator(
     "face_features",
     face_features_kernel,
@@ -228,17 +264,36 @@ def body_interaction(
     expect("centroids", centroids, (None, 3), device=bodies.device)
     expect("next_vertices", next_vertices, tuple(bodies.vertices.shape), device=bodies.device)
     body_of_face = bodies.body_of("body_of_face", body_of_face, len(centroids))
-    return BodyInteraction(
-        *_body_interaction(
-            bodies.mesh_ids,
-            bodies.face_offsets,
-            bodies.faces,
-            centroids.detach(),
-            body_of_face,
-            bodies.vertices,
-            next_vertices.detach(),
-        )
+    centroids, next_vertices = centroids.detach(), next_vertices.detach()
+    rows, device = len(centroids), bodies.device
+    found = BodyInteraction(
+        closest=allocate((rows, 3), torch.float32, device),
+        sign=allocate((rows,), torch.float32, device),
+        face=allocate((rows,), torch.int32, device),
+        deformation=allocate((rows, 3, 3), torch.float32, device),
+        velocity=allocate((rows, 3), torch.float32, device),
     )
+    if rows:
+        with torch_stream(device) as warp_device:
+            wp.launch(
+                body_interaction_kernel,
+                dim=rows,
+                inputs=[
+                    bodies.model,
+                    as_warp(centroids, wp.vec3),
+                    as_warp(body_of_face, wp.int32),
+                    as_warp(next_vertices, wp.vec3),
+                ],
+                outputs=[
+                    as_warp(found.closest, wp.vec3),
+                    as_warp(found.sign, wp.float32),
+                    as_warp(found.face, wp.int32),
+                    as_warp(found.deformation, wp.mat33),
+                    as_warp(found.velocity, wp.vec3),
+                ],
+                device=warp_device,
+            )
+    return found
 
 
 def face_features(
@@ -285,3 +340,52 @@ def face_features(
         interaction.deformation,
         interaction.velocity,
     )
+
+
+def frame_features(
+    inverse_rest: torch.Tensor,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    garment_of_face: torch.Tensor,
+    garment_mean: torch.Tensor,
+    body_of_face: torch.Tensor | None,
+    bodies: BodyMeshes,
+    next_vertices: torch.Tensor,
+) -> torch.Tensor:
+    """`face_features` with the `body_interaction` of the faces' centroids, in one launch and without gradients.
+
+    Args:
+        inverse_rest, vertices, faces, garment_of_face, garment_mean: As in `face_features`.
+        body_of_face, bodies, next_vertices: As in `body_interaction`.
+
+    Returns:
+        float32 [F, 34]; columns as in `LAYOUT`.
+    """
+    expect_mesh(vertices, faces)
+    rows, device = faces.shape[0], bodies.device
+    expect("vertices", vertices, (None, 3), device=device)
+    expect("inverse_rest", inverse_rest, (rows, 3, 3), device=device)
+    expect("garment_of_face", garment_of_face, (rows,), torch.int32, device)
+    expect("garment_mean", garment_mean, (None, 3), device=device)
+    expect("next_vertices", next_vertices, tuple(bodies.vertices.shape), device=device)
+    body_of_face = bodies.body_of("body_of_face", body_of_face, rows)
+    features = allocate((rows, FEATURES), torch.float32, device)
+    if rows:
+        with torch_stream(device) as warp_device:
+            wp.launch(
+                frame_features_kernel,
+                dim=rows,
+                inputs=[
+                    bodies.model,
+                    as_warp(inverse_rest, wp.mat33),
+                    as_warp(faces, wp.vec3i),
+                    as_warp(garment_of_face, wp.int32),
+                    as_warp(body_of_face, wp.int32),
+                    as_warp(vertices, wp.vec3),
+                    as_warp(garment_mean, wp.vec3),
+                    as_warp(next_vertices, wp.vec3),
+                ],
+                outputs=[as_warp(features, wp.float32)],
+                device=warp_device,
+            )
+    return features

@@ -76,7 +76,7 @@ def _signed_distance(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     bodies = BodyMeshes(body_vertices, body_faces)
     body = bodies.body_of("body", None, len(points))
-    result = query_bodies(bodies.mesh_ids, bodies.face_offsets, points, body)
+    result = query_bodies(bodies.model, points, body, torch.full((1,), float("inf"), device=points.device))
     with torch_stream(points.device):
         del bodies  # freed in stream order, after the launch
     return result

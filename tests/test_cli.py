@@ -167,7 +167,7 @@ def test_bench_prints_a_row_per_stage(capsys) -> None:
     assert cli.main(["bench", "--frames", "1", "--batch", "2", "--device", "cpu"]) == 0
     lines = capsys.readouterr().out.splitlines()
     named = {line.split("  ")[0].strip(): line.split()[-1] for line in lines[3:]}
-    for stage in ("features", "signed distance", "network", "singular values", "poisson", "collision"):
+    for stage in ("features", "network", "singular values", "poisson", "collision"):
         assert float(named[stage]) > 0
 
 

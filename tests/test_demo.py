@@ -43,7 +43,7 @@ def test_demo_writes_what_it_prints(tmp_path, capsys, bundle) -> None:
     names = {"rollout.png", "demo.mp4"} | {f"{n}.{s}" for n in ("dress", "tshirt") for s in ("usd", "pc2", "obj")}
     assert {p.name for p in (tmp_path / "demo").iterdir()} == names
     rows = {line.split("  ")[0].strip(): line.split()[-2:] for line in printed.splitlines()}
-    for stage in ("features", "signed distance", "network", "singular values", "poisson", "collision"):
+    for stage in ("features", "network", "singular values", "poisson", "collision"):
         assert all(float(cell) > 0 for cell in rows[f"{stage} [ms/frame]"])
     assert rows["frames"] == ["4", "4"]
     for column, (name, motion) in enumerate(motions.items()):

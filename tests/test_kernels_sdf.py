@@ -53,10 +53,9 @@ def test_agrees_with_libigl(name, scale, poisoned):
     assert np.abs(np.linalg.norm(points - closest.astype(float), axis=1) - unsigned).max() <= tolerance
 
     winding = reference.winding_number(points, body.vertices, body.faces)
-    # Kernels sum distant faces in groups, which moves the winding number a little: of 20,000 points, none further
-    # than 0.001 from 0.5 changed side. Only a body with holes has such points. On the surface, the sign is a matter
-    # of rounding.
-    certain = (np.abs(winding - 0.5) > 0.005) & (unsigned > tolerance)
+    # Only a body with holes has points between 0 and 1; what its holes take away is summed in float64. On the surface,
+    # the sign is a matter of rounding.
+    certain = (np.abs(winding - 0.5) > 1e-5) & (unsigned > tolerance)
     assert certain.mean() > 0.98
     assert np.array_equal(np.sign(distance[certain]), np.where(winding > 0.5, -1.0, 1.0)[certain])
 
@@ -308,10 +307,7 @@ def test_operators_keep_torch_contracts():
     """Operators would break under torch.compile, export or autograd (schema, fake shapes, backward registration)."""
     vertices, faces = tensors(BODIES["tetrahedron"])
     points = torch.tensor(points_around(BODIES["tetrahedron"], 20))
-    bodies = sdf.BodyMeshes(vertices, faces)
-    body = torch.zeros(20, dtype=torch.int32)
     operators = torch.ops.warpgarment
     torch.library.opcheck(
         operators.signed_distance.default, (points.requires_grad_(), vertices.requires_grad_(), faces)
     )
-    torch.library.opcheck(operators.query_bodies.default, (bodies.mesh_ids, bodies.face_offsets, points.detach(), body))

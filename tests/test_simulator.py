@@ -459,7 +459,7 @@ def test_pretrained_networks_are_the_saved_ones(tmp_path):
     half = simulator(made, half=True).rollout(garment, motion)
     assert 0 < np.abs(half.vertices - sim.rollout(garment, motion).vertices).max() < 1e-3
     assert made.training  # dropout was off for the simulation, and is on again
-    assert set(sim.timings) == {"signed distance", "features", "network", "singular values", "poisson", "collision"}
+    assert set(sim.timings) == {"features", "network", "singular values", "poisson", "collision"}
     assert all(seconds > 0 for seconds in sim.timings.values())
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from .motion import GarmentMotion
 from .status import Verdict
 
-STAGES = ("features", "signed distance", "network", "singular values", "poisson", "collision")
+STAGES = ("features", "network", "singular values", "poisson", "collision")
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -12,14 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from warpgarment import memory
+from warpgarment import differentiable, memory
 from warpgarment.batch import PackedBodies, PackedGarments, padded_views
 from warpgarment.errors import MeshError
 from warpgarment.frame_graph import GraphedFrames
 from warpgarment.garment import Garment
 from warpgarment.kernels.collision import CollisionSolver
-from warpgarment.kernels.deformation import face_centroids, inverse_rest_frames, replace_singular_values, segment_mean
-from warpgarment.kernels.features import LAYOUT, BodyInteraction, body_interaction, face_features
+from warpgarment.kernels.deformation import inverse_rest_frames
+from warpgarment.kernels.face_means import FaceMeans
+from warpgarment.kernels.features import frame_features
+from warpgarment.kernels.next_gradients import next_gradients
 from warpgarment.kernels.poisson import PoissonSolver
 from warpgarment.kernels.sdf import BodyMeshes
 from warpgarment.network import ManifoldAwareTransformer, NetworkOutput
@@ -78,6 +80,9 @@ class Scene:
         memory.check(garments, bodies, network.config, face_splits=face_splits, half=half, device=device)
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
+        vertex_count = len(packed.rest_vertices)
+        self._garment_means = FaceMeans(packed.faces, packed.garment_of_face, packed.count, vertex_count)
+        self._component_means = FaceMeans(packed.faces, packed.face_component, packed.component_count, vertex_count)
 
         margins = [clearance(garment) if epsilon is None else epsilon for garment in garments]
         self.epsilon = torch.tensor(margins, device=device)[packed.garment_of_vertex.long()]
@@ -120,19 +125,29 @@ class Scene:
 
     def components_mean(self, vertices: torch.Tensor) -> torch.Tensor:
         """Mean face centroid of each component (z of the paper) [m], [V,3] -> [C,3]."""
-        centroids = face_centroids(vertices, self.packed.faces)
-        return segment_mean(centroids, self.packed.face_component, self.packed.component_count)
+        if vertices.requires_grad:
+            return differentiable.components_mean(self.packed, vertices)
+        return self._component_means(vertices)
 
     def features(self, vertices: torch.Tensor, body_vertices: torch.Tensor, next_body: torch.Tensor) -> torch.Tensor:
         """Features of a frame, step 1: garments [V,3] on bodies [U,3] that will be at `next_body` [U,3] -> [F,34]."""
         packed = self.packed
-        with self.timings("signed distance"):
-            centroids = face_centroids(vertices, packed.faces)
-            bodies = self.bodies(body_vertices)
-            interaction: BodyInteraction = body_interaction(centroids, self.body_of_face, bodies, next_body)
         with self.timings("features"):
-            mean = segment_mean(centroids, packed.garment_of_face, packed.count)
-            return face_features(self.inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, interaction)
+            bodies = self.bodies(body_vertices)
+            if vertices.requires_grad:
+                return differentiable.features(
+                    packed, self.inverse_rest, vertices, self.body_of_face, bodies, next_body
+                )
+            return frame_features(
+                self.inverse_rest,
+                vertices,
+                packed.faces,
+                packed.garment_of_face,
+                self._garment_means(vertices),
+                self.body_of_face,
+                bodies,
+                next_body,
+            )
 
     def predict(self, stacked: torch.Tensor, velocities: torch.Tensor) -> Step:
         """The network, step 2: stacked features [F,H,34] and velocities [C,H-1,3] -> what happens next."""
@@ -174,16 +189,12 @@ class Scene:
         """
         packed = self.packed
         with self.timings("singular values"):
-            phi = features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3)
-            sound = torch.isfinite(step.psi).flatten(1).all(1) & torch.isfinite(step.singular_values).all(1)
-            sound &= torch.isfinite(step.velocity).all(1)[packed.face_component.long()]
-            finite = self.all_of(sound, packed.garment_of_face)
-            kept = finite[packed.garment_of_face.long()]  # NaN of one garment must not reach a solver
-            psi = torch.where(kept[:, None, None], step.psi, torch.eye(3, device=phi.device))
-            target = (psi @ phi).contiguous()
-            if self.network.config.replace_singular_values:
-                stretch = torch.where(kept[:, None], step.singular_values, 1.0).clamp(min=SMALLEST_SINGULAR_VALUE)
-                target = replace_singular_values(target, stretch)
+            options = {"replace": self.network.config.replace_singular_values, "smallest": SMALLEST_SINGULAR_VALUE}
+            if step.psi.requires_grad or features.requires_grad:
+                target, finite = differentiable.next_gradients(packed, features, step, **options)
+            else:
+                owners = (packed.face_component, packed.garment_of_face, packed.count)
+                target, finite = next_gradients(features, *step, *owners, **options)
         with self.timings("poisson"):
             velocity = torch.nan_to_num(step.velocity, 0.0, 0.0, 0.0)
             mean = self.components_mean(vertices) + velocity
@@ -248,7 +259,8 @@ class Scene:
 
         `on_body` [V] may leave garments out, whose depth is then NaN.
         """
-        inside = -bodies.query(vertices, self.body_of_vertex if on_body is None else on_body).distance
+        on_body = self.body_of_vertex if on_body is None else on_body
+        inside = -bodies.query(vertices, on_body, within=0.0).distance
         index = self.packed.garment_of_vertex.long()
         return inside.new_zeros(self.packed.count).scatter_reduce(0, index, inside, "amax")
 
