@@ -255,6 +255,16 @@ def test_what_does_not_belong_together(evaluated, tmp_path, change, word):
     assert not list((tmp_path / "out").rglob("*.*"))
 
 
+def test_an_evaluation_from_before_a_setting_came(evaluated, tmp_path):
+    """Evaluations written by earlier versions would be said to be of another network: settings that came since have
+    their defaults in them."""
+    path = edited(evaluated, tmp_path / "e.json", lambda r: r["network"]["config"].pop("replace_singular_values"))
+    settings, notes = checkpoint.read_metadata(checkpoint.find(config(evaluated, tmp_path).network))
+    assert model_card.read_evaluation(path, vars(settings), notes)["sequences"]
+    with pytest.raises(CardError, match="is of another network"):
+        model_card.read_evaluation(path, vars(settings) | {"replace_singular_values": False}, notes)
+
+
 def test_files_that_are_missing(evaluated, tmp_path):
     """An evaluation or a log that is not there would end in a stack trace."""
     with pytest.raises(CardError, match=r"none\.json: no result"):

@@ -84,10 +84,22 @@ def test_rows_change_what_they_say_and_nothing_else(data, tmp_path):
         "without_average": {"average": 0.0},
         "without_augmentation": no_turns,
         "whole_garments": {"splits": 1},
+        "unrolled": {"unroll.steps": 2},
     }
     assert found.keys() == expected.keys()
     for name, changed in expected.items():
         assert five_digits(found[name]) == five_digits(changed), name  # settings have six
+
+
+def test_an_unrolled_recipe_is_compared_with_one_step(data, tmp_path):
+    """The row would change nothing, or a recipe that cannot be unrolled would have no table at all."""
+
+    def names(*changes):
+        config = config_for(data, tmp_path, settings=(*QUICK, *changes), rows=())
+        return {row.name: row for row in compare.plan(config)[1]}
+
+    assert names("unroll.steps=3")["one_step"].settings == ("unroll.steps=1",)
+    assert {"unrolled", "one_step"}.isdisjoint(names("compile=true"))
 
 
 def test_rows_that_would_be_the_recipe_itself_are_left_out(data, tmp_path):

@@ -10,6 +10,7 @@ Writes `card.md` and `card/*.png`: what the network is, the data, the training a
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment import checkpoint
+from warpgarment.config import NetworkConfig
 from warpgarment.io.atomic import atomic_file, atomic_folder
 from warpgarment.simulator import Simulator
 
@@ -157,7 +159,9 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
         rows = [row for row in result["sequences"] if row["start"] == "cold" and row["network"] is not None]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CardError(f"{path}: no result of an evaluation ({type(error).__name__}: {error})") from error
-    if about.get("config") != dict(config) or about.get("notes") != dict(notes):
+    # A setting that came later has its default in what was written before
+    settings = {f.name: f.default for f in dataclasses.fields(NetworkConfig)} | dict(about.get("config") or {})
+    if settings != dict(config) or about.get("notes") != dict(notes):
         raise CardError(
             f"{path}: is of another network ({about.get('file')}; its settings or notes differ). Evaluate this one."
         )

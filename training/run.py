@@ -56,16 +56,10 @@ class Run:
         self.config, self.network, self.validation, self.began = config, network, validation, began
         self.out, self.group, self.device = Path(config.out), group, group.device
         self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
-        if config.unroll.steps > 1:
-            builder = UnrolledBuilder(
-                builder.sequences,
-                network,
-                config.noise,
-                config.augmentation,
-                config.unroll.steps,
-                config.unroll.collision_passes,
-            )
-        ahead = config.ahead if config.unroll.steps == 1 else 0  # a scene's solvers belong to one thread
+        steps, passes, ahead = config.unroll.steps, config.unroll.collision_passes, config.ahead
+        if steps > 1:
+            builder = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
+            ahead = 0  # a scene's solvers belong to one thread
         self.loader = Loader(builder, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
@@ -142,8 +136,7 @@ class Run:
             self.average.update(self.network)
         self.log = RunLog(self.out if group.first else None, self.step if resumed else None)
         settings = (self.network, config.loss, config.noise.features, config.precision)
-        unrolled = config.unroll.steps > 1
-        objective = UnrolledObjective(*settings, config.unroll) if unrolled else Objective(*settings)
+        objective = UnrolledObjective(*settings, config.unroll) if config.unroll.steps > 1 else Objective(*settings)
         self.names = (*objective.figures, "gradient_norm")
         self.recent = [row for row in self.recent if len(row) == len(self.names)]  # else of another objective
         self.trainer = Trainer(objective, group, config.compile)
@@ -298,9 +291,8 @@ class Run:
         path = self.out / f"not_finite_{step}.npz"
         if self.group.first:
             batch = self.loader.build(step, part=slice(None))
-            names = np.array([name for name, _ in batch.ids])
-            frames = np.array([frame for _, frame in batch.ids])
-            np.savez(path, sequence=names, frame=frames, **batch.arrays())
+            names, frames = zip(*batch.ids, strict=True)
+            np.savez(path, sequence=np.array(names), frame=np.array(frames), **batch.arrays())
         self.group.wait()
         raise NonFiniteLoss(
             f"the loss or gradient of step {step} is not finite; its batch is in {path}. Look for features that are "

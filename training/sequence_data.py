@@ -70,7 +70,7 @@ class SequenceData:
     def garment(self) -> Garment:
         """The garment, with the cached geodesics, for unrolled samples."""
         garment = self.source.garment
-        garment.__dict__.setdefault("geodesics", self._geodesics)
+        garment.__dict__.setdefault("geodesics", _writable(self._geodesics))
         return garment
 
     def body_frames(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:

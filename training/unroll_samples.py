@@ -111,7 +111,7 @@ class UnrolledBuilder(SampleBuilder):
         return newest + self.steps < len(self.sequences[sequence].vertices)
 
     @torch.no_grad()
-    def build(  # type: ignore[override]
+    def build(
         self,
         picks: list[tuple[int, int]],
         faces: int,

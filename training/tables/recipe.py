@@ -39,7 +39,13 @@ def recipe(common: TrainConfig) -> list[Variant]:
         return f"noise.position={noise.position * factor:.6g}", f"noise.offset={noise.offset * factor:.6g}"
 
     shape = ("residual=false", "heading=world", "norm_first=false", "activation=relu")
-    plain = ("pushforward.share=0.0", "average=0.0", "augmentation.mirror=0.0", "augmentation.yaw=0.0")
+    plain = (
+        "pushforward.share=0.0",
+        "average=0.0",
+        "augmentation.mirror=0.0",
+        "augmentation.yaw=0.0",
+        "unroll.steps=1",
+    )
     gaussian = (*displaced(0.0), f"noise.features={noise.features or PAPER_NOISE!r}")
     rows = [
         Variant(AS_GIVEN, "as given"),
@@ -56,6 +62,10 @@ def recipe(common: TrainConfig) -> list[Variant]:
         ),
         Variant("whole_garments", "whole garments throughout", (), ("splits=1",)),
     ]
+    if common.unroll.steps > 1:
+        rows.append(Variant("one_step", "one step at a time", (), ("unroll.steps=1",)))
+    elif not (common.compile or common.augmentation.scale):  # which unrolled training does not know
+        rows.append(Variant("unrolled", "two steps in a row", (), ("unroll.steps=2",)))
     return rows
 
 
