@@ -34,7 +34,7 @@ import torch
 
 from . import cg, compliance, factor
 from ._torch import expect
-from .body_meshes import BodyMeshes
+from .body_meshes import BodyMeshes, BodyQuery
 from .collision_operator import ADJOINT_TOLERANCE as ADJOINT_TOLERANCE
 from .collision_operator import model_of
 from .compliance import Compliance
@@ -127,6 +127,7 @@ class CollisionSolver:
         epsilon: float | torch.Tensor = 0.004,
         passes: int = 1,
         tolerance: float = TOLERANCE,
+        found: BodyQuery | None = None,
     ) -> torch.Tensor:
         """Minimises eq. 5 of supplement section 2 for the contacts found at `vertices`.
 
@@ -140,6 +141,7 @@ class CollisionSolver:
             passes: How often detection and solve are done, each from the result of the one before.
             tolerance: Where the iteration stops: error in the energy norm [m]. The default keeps every vertex within
                 0.02 mm of the exact minimiser.
+            found: What `bodies.query` says of `vertices`, from a caller who knows it; it is asked otherwise.
 
         Returns:
             Positions [m], float32 [V,3]; components without contacts come back unchanged.
@@ -162,7 +164,8 @@ class CollisionSolver:
             raise ValueError(f"passes must be at least 1, got {passes}")
         limit = torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
         for number in range(passes):
-            query = bodies.query(vertices.detach(), body_of_vertex)
+            known = found if number == 0 else None
+            query = bodies.query(vertices.detach(), body_of_vertex) if known is None else known
             closest, normal = contacts(vertices, query.distance, query.face, bodies, math.inf if each else epsilon)
             if isinstance(epsilon, torch.Tensor):  # n.(V - U) - e = n.(V - (U + e n)), so the solver's epsilon is zero
                 normal = torch.where((query.distance < epsilon)[:, None], normal, 0.0)

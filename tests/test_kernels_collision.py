@@ -183,6 +183,8 @@ def test_passes_repeat_detection_and_solve():
     iterations += solver.iterations
     assert torch.equal(solver.refine(torch.tensor(rest.vertices), bodies, passes=2), second)
     assert solver.iterations == iterations
+    assert torch.equal(solver.refine(first, bodies, found=bodies.query(first)), second)
+    assert not torch.equal(solver.refine(first, bodies, found=bodies.query(second)), second)
     depth = [-float(bodies.query(v).distance.min()) for v in (torch.tensor(rest.vertices), first, second)]
     assert depth[0] > depth[1] > depth[2]
 

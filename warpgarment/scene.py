@@ -208,14 +208,17 @@ class Scene:
         """
         with self.timings("collision"):
             bodies = self.bodies(next_body)
-            pending, depth, iterations = finite.clone(), None, 0
+            pending, depth, found, iterations = finite.clone(), None, None, 0
             for _ in range(self.collision_passes):
-                refined = self.collision.refine(vertices, bodies, self.body_of_vertex, epsilon=self.epsilon)
+                refined = self.collision.refine(
+                    vertices, bodies, self.body_of_vertex, epsilon=self.epsilon, found=found
+                )
                 iterations += self.collision.iterations
                 mine = pending[self.packed.garment_of_vertex.long()]
                 refined = torch.where(mine[:, None], refined, vertices)
                 vertices, finite = self.keep_finite(refined, vertices, finite)
-                before, depth = depth, self.depth(vertices, bodies)
+                found = bodies.query(vertices, self.body_of_vertex)  # how deep now, and the next pass's contacts
+                before, depth = depth, self.deepest(found.distance)
                 pending = finite & (depth > SHALLOW)
                 if before is not None:
                     pending &= depth < WORTHWHILE * before
@@ -227,9 +230,12 @@ class Scene:
 
     def depth(self, vertices: torch.Tensor, bodies: BodyMeshes) -> torch.Tensor:
         """How deep the deepest vertex of each garment is in its body [m], at least 0; shape [B]."""
-        inside = -bodies.query(vertices, self.body_of_vertex).distance
+        return self.deepest(bodies.query(vertices, self.body_of_vertex).distance)
+
+    def deepest(self, distance: torch.Tensor) -> torch.Tensor:
+        """The same from the signed distances of the vertices [m], [V] -> [B]."""
         index = self.packed.garment_of_vertex.long()
-        return inside.new_zeros(self.packed.count).scatter_reduce(0, index, inside, "amax")
+        return distance.new_zeros(self.packed.count).scatter_reduce(0, index, -distance, "amax")
 
     def keep_finite(
         self, new: torch.Tensor, old: torch.Tensor, finite: torch.Tensor
