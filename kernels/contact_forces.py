@@ -6,7 +6,7 @@ As in compliance.py the unknowns are the forces y, one per contact, and conjugat
 
 but S is applied and not formed: B⁻¹ costs two sweeps over L (factor.py). A load on contacts reaches the ancestors of
 their places in the elimination tree and nothing else, and displacements at contacts depend on nothing else, so that the
-sweeps of the iteration pass over these `active` places only.
+sweeps of the iteration pass over the panels of these places only, the `active` ones.
 
 All eigenvalues of I + S are at least 1. Hence the error in the energy norm is at most |c - (I + S) y|, and this is what
 the iteration is stopped by, at every step. A diagonal preconditioner would not pay: S_ii hardly varies.
@@ -28,26 +28,7 @@ from . import cg
 from ._operator import allocate
 from ._torch import torch_stream
 from .factor import Factor
-from .triangular import eliminate_place, padded, substitute_place
-
-
-@wp.func
-def apply_inverse(
-    base: int,
-    first: int,
-    actives: int,
-    active: wp.array[wp.int32],
-    pivot: wp.array[wp.float64],
-    pointer: wp.array[wp.int32],
-    column: wp.array[wp.int32],
-    value: wp.array[wp.float64],
-    x: wp.array[wp.vec4d],
-):
-    """x becomes B⁻¹ x at the active places, for x that is zero elsewhere."""
-    for m in range(actives):
-        eliminate_place(base, first, active[first + m], pivot, pointer, column, value, x)
-    for m in range(actives):
-        substitute_place(base, first, active[first + actives - 1 - m], pointer, column, value, x)
+from .triangular import eliminate, padded, substitute_back, substitution
 
 
 @wp.kernel(enable_backward=False)
@@ -56,11 +37,13 @@ def contact_forces(
     start: wp.array[wp.int32],
     rows: wp.array[wp.int32],
     base: wp.array[wp.int32],
+    work: wp.array[wp.int32],
     order: wp.array[wp.int32],
-    pivot: wp.array[wp.float64],
+    pivot: wp.array[wp.vec4d],
+    triangle: wp.array[wp.mat44d],
     pointer: wp.array[wp.int32],
-    column: wp.array[wp.int32],
-    value: wp.array[wp.float64],
+    row: wp.array[wp.int32],
+    value: wp.array[wp.vec4d],
     # In:
     normal: wp.array[wp.vec3d],
     gap: wp.array[wp.float64],
@@ -71,7 +54,7 @@ def contact_forces(
     place: wp.array[wp.int32],
     active: wp.array[wp.int32],
     reached: wp.array[wp.int32],
-    direction_of: wp.array[wp.vec4d],
+    toward: wp.array[wp.vec4d],
     residual: wp.array[wp.float64],
     direction: wp.array[wp.float64],
     image: wp.array[wp.float64],
@@ -87,35 +70,41 @@ def contact_forces(
     component = wp.tid()
     b = base[component]
     if b >= 0:
-        first = start[component]
-        size = start[component + 1] - first
+        begin = start[component]
+        first = work[component]  # of all vectors, which hold a number per place or contact
+        panels = (start[component + 1] - begin + 3) / 4
         zero = wp.float64(0.0)
+
+        # The contacts, and the panels that they reach.
         count = wp.int32(0)
         actives = wp.int32(0)
         rr = zero
-        for k in range(size):
+        for k in range(4 * panels):
             reached[first + k] = 0
             x[first + k] = wp.vec4d()
-        for k in range(size):
-            i = rows[first + order[b + k]]
-            n = normal[i]
-            force[i] = zero
-            increment[i] = wp.vec3d()
-            if n[0] != zero or n[1] != zero or n[2] != zero:
-                c = gap[i]
-                place[first + count] = k
-                direction_of[first + count] = padded(n)
-                residual[first + count] = c
-                direction[first + count] = c
-                solution[first + count] = zero
-                rr += c * c
-                count += 1
-                reached[first + k] = 1
-            if reached[first + k] == 1:
-                active[first + actives] = k
+        for q in range(panels):
+            for r in range(4):
+                k = 4 * q + r
+                if order[b + k] >= 0:
+                    i = rows[begin + order[b + k]]
+                    n = normal[i]
+                    force[i] = zero
+                    increment[i] = wp.vec3d()
+                    if n[0] != zero or n[1] != zero or n[2] != zero:
+                        c = gap[i]
+                        place[first + count] = first + k
+                        toward[first + count] = padded(n)
+                        residual[first + count] = c
+                        direction[first + count] = c
+                        solution[first + count] = zero
+                        rr += c * c
+                        count += 1
+                        reached[first + q] = 1
+            if reached[first + q] == 1:
+                active[first + actives] = q
                 actives += 1
-                if pointer[b + k] < pointer[b + k + 1]:
-                    reached[first + column[pointer[b + k]]] = 1  # the parent in the elimination tree
+                for e in range(pointer[b / 4 + q], pointer[b / 4 + q + 1]):
+                    reached[first + row[e] / 4] = 1
 
         goal = tolerance[component] * tolerance[component]
         total = zero
@@ -123,23 +112,29 @@ def contact_forces(
         running = rr > goal
         while running and iteration < max_iterations:
             for m in range(actives):
-                x[first + active[first + m]] = wp.vec4d()
+                for r in range(4):
+                    x[first + 4 * active[first + m] + r] = wp.vec4d()
             for m in range(count):
-                x[first + place[first + m]] = direction[first + m] * direction_of[first + m]
-            apply_inverse(b, first, actives, active, pivot, pointer, column, value, x)
+                x[place[first + m]] = direction[first + m] * toward[first + m]
+            for m in range(actives):
+                q = active[first + m]
+                eliminate(b / 4 + q, first + 4 * q, first, pivot, triangle, pointer, row, value, x)
+            for m in range(actives):
+                q = active[first + actives - 1 - m]
+                substitute_back(b / 4 + q, first + 4 * q, first, triangle, pointer, row, value, x)
             pq = zero
             for m in range(count):
                 p = direction[first + m]
-                q = p + wp.dot(direction_of[first + m], x[first + place[first + m]])
-                image[first + m] = q
-                pq += p * q
+                s = p + wp.dot(toward[first + m], x[place[first + m]])
+                image[first + m] = s
+                pq += p * s
             alpha = rr / pq
             rr_next = zero
             for m in range(count):
                 solution[first + m] = solution[first + m] + alpha * direction[first + m]
-                r = residual[first + m] - alpha * image[first + m]
-                residual[first + m] = r
-                rr_next += r * r
+                left = residual[first + m] - alpha * image[first + m]
+                residual[first + m] = left
+                rr_next += left * left
             beta = rr_next / rr
             for m in range(count):
                 direction[first + m] = residual[first + m] + beta * direction[first + m]
@@ -151,20 +146,24 @@ def contact_forces(
             for m in range(count):
                 solution[first + m] = rr
 
+        # D = B⁻¹ N y, at all places.
         if count > 0:
             for m in range(actives):
-                x[first + active[first + m]] = wp.vec4d()
+                for r in range(4):
+                    x[first + 4 * active[first + m] + r] = wp.vec4d()
             for m in range(count):
-                y = solution[first + m]
-                x[first + place[first + m]] = y * direction_of[first + m]
-                force[rows[first + order[b + place[first + m]]]] = y
+                x[place[first + m]] = solution[first + m] * toward[first + m]
+                force[rows[begin + order[b + place[first + m] - first]]] = solution[first + m]
             for m in range(actives):
-                eliminate_place(b, first, active[first + m], pivot, pointer, column, value, x)
-            for m in range(size):
-                k = size - 1 - m
-                substitute_place(b, first, k, pointer, column, value, x)
-                d = x[first + k]
-                increment[rows[first + order[b + k]]] = wp.vec3d(d[0], d[1], d[2])
+                q = active[first + m]
+                eliminate(b / 4 + q, first + 4 * q, first, pivot, triangle, pointer, row, value, x)
+            for m in range(panels):
+                q = panels - 1 - m
+                substitute_back(b / 4 + q, first + 4 * q, first, triangle, pointer, row, value, x)
+            for k in range(4 * panels):
+                if order[b + k] >= 0:
+                    d = x[first + k]
+                    increment[rows[begin + order[b + k]]] = wp.vec3d(d[0], d[1], d[2])
         report[component] = wp.where(running, -iteration, iteration)
         error[component] = wp.sqrt(rr)
 
@@ -198,20 +197,18 @@ def solve(
     Returns:
         Forces y, float64 [V].
     """
-    vertices, device = len(normal), normal.device
-    integers = allocate((3, vertices), torch.int32, device)
-    scalars, vectors = (allocate((n, vertices, w), torch.float64, device) for n, w in ((4, 1), (2, 4)))
-    force = torch.zeros(vertices, dtype=torch.float64, device=device)
+    places, device = int(factor.counts[3]), normal.device
+    integers = allocate((3, places), torch.int32, device)
+    scalars, vectors = allocate((4, places), torch.float64, device), allocate((2, places, 4), torch.float64, device)
+    force = torch.zeros(len(normal), dtype=torch.float64, device=device)
     with torch_stream(device) as warp_device:
         wp.launch(
             contact_forces,
             dim=len(factor.base),
             inputs=[
-                *(cg.view(t, wp.int32) for t in (system.start, system.rows, factor.base, factor.order)),
-                cg.view(factor.pivot, wp.float64),
-                cg.view(factor.pointer, wp.int32),
-                cg.view(factor.column, wp.int32),
-                cg.view(factor.value, wp.float64),
+                cg.view(system.start, wp.int32),
+                cg.view(system.rows, wp.int32),
+                *substitution(factor),
                 cg.view(normal, wp.vec3d),
                 cg.view(gap, wp.float64),
                 cg.view(tolerance, wp.float64),
@@ -219,7 +216,7 @@ def solve(
                 int(max_iterations),
                 *(cg.view(t, wp.int32) for t in integers),
                 cg.view(vectors[0], wp.vec4d),
-                *(cg.view(t.view(-1), wp.float64) for t in scalars),
+                *(cg.view(t, wp.float64) for t in scalars),
                 cg.view(vectors[1], wp.vec4d),
                 cg.view(force, wp.float64),
                 cg.view(increment, wp.vec3d),

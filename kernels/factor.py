@@ -6,20 +6,25 @@ the factor. Two forms of it:
 
 | form | stored | applied by |
 | --- | --- | --- |
-| substitution | L by columns | one lane after the other: for a CPU |
+| substitution | L by panels of four columns | one lane after the other: for a CPU |
 | explicit | W = L⁻¹ by columns and by rows | two sparse products, all rows at once: for a GPU |
 
 Column j of W reaches the ancestors of j in the elimination tree and nothing else, so that with `depth` counted from
 the root its entry in row r is at place depth_j - depth_r. (Liu 1990, "The role of elimination trees".) W has 7 to 15
 times as many entries as L for 1,000 to 25,000 vertices, and still 20 times fewer than A⁻¹.
 
+A panel holds every row in which one of its four columns has an entry, and reads that row of x once for all four: half
+the entries of L are left, and each costs no more than an entry of a single column did.
+
 A factor is tried on a random vector before it is trusted. Components whose matrix is too badly conditioned for it, or
 that don't fit in the budget, have none, and are left to cg.py.
 
 | symbol | code | what |
 | --- | --- | --- |
-| L, W | `pointer, column, value` | strictly lower part by columns; columns are places in elimination order |
-| Wᵀ | `row_pointer, row_column, row_value` | strictly lower part by rows; explicit form only |
+| L | `pointer, column, value` | by panels: for each row (a place) below it, four numbers |
+| | `triangle` | [4,4] within a panel, strictly lower |
+| W | `pointer, column, value` | explicit form: strictly lower part by columns; indices are places |
+| Wᵀ | `row_pointer, row_column, row_value` | strictly lower part by rows |
 | D⁻¹ | `pivot` | one per place |
 """
 
@@ -38,7 +43,8 @@ from scipy.sparse.linalg import splu
 from . import cg
 
 BUDGET = 2**26
-"""Entries of all factors of a solver together, 12 bytes each (768 MiB)."""
+"""Numbers in all factors of a solver together, 8 bytes each and half as much for indices (768 MiB)."""
+PANEL = 4
 TRUSTED = 1e-6
 """Error of a trial solve, as a share of its random solution, up to which a factor is used."""
 
@@ -48,19 +54,23 @@ class Factor(NamedTuple):
 
     base: torch.Tensor
     """int32 [C], where the places of a component begin in `order` and `pivot`; -1 for a component without a factor."""
+    first: torch.Tensor
+    """int32 [C], where the work of a component begins; in the form for substitution padded to full panels."""
     order: torch.Tensor
-    """int32 [R], the vertex within its component that is eliminated at this place."""
+    """int32 [R], the vertex within its component that is eliminated at this place; -1 where a panel is padded."""
     pivot: torch.Tensor
     """float64 [R]."""
+    triangle: torch.Tensor
+    """float64 [R/4,4,4]; empty in the explicit form."""
     pointer: torch.Tensor
     column: torch.Tensor
     value: torch.Tensor
     row_pointer: torch.Tensor
     row_column: torch.Tensor
     row_value: torch.Tensor
-    """CSR, [R,R], int32, int32 and float64; the last three are empty in the form for substitution."""
+    """int32, int32 and float64; the last three are empty in the form for substitution."""
     counts: torch.Tensor
-    """int64 [3] on the host: components with a factor, components without, 1 if explicit."""
+    """int64 [4] on the host: components with a factor, components without, 1 if explicit, places of all components."""
 
     @classmethod
     def build(
@@ -82,28 +92,31 @@ class Factor(NamedTuple):
             skip: Components that need no factor, bool [C].
         """
         device = system.value.device
-        bases, parts = [], []
+        bases, lengths, parts = [], [], []
         known: dict[tuple, int] = {}
         places = used = 0
         for number, (key, block) in enumerate(component_blocks(matrix, system)):
+            count = block.shape[0]
+            lengths.append(count if explicit else -(-count // PANEL) * PANEL)
             if skip is not None and skip[number]:
                 bases.append(-1)
                 continue
             if key not in known:
                 known[key] = -1
-                part = _factored(block, explicit, (budget - used), device)
+                part = _factored(block, explicit, budget - used, device)
                 if part is not None:
-                    known[key], places = places, places + block.shape[0]
-                    used += sum(triangle.nnz for triangle in part[2:])
+                    known[key], places = places, places + lengths[-1]
+                    used += sum(values.size for _, _, values in part[3:])
                     parts.append(part)
             bases.append(known[key])
-        order, pivot = (np.concatenate([p[i] for p in parts] or [np.zeros(0)]) for i in range(2))
-        lower = _stacked([p[2] for p in parts])
-        rows = _stacked([p[3] for p in parts] if explicit else [])
-        base = np.array(bases, np.int32)
-        host = (base, order.astype(np.int32), pivot.astype(np.float64), *lower, *rows)
-        counts = torch.tensor([int((base >= 0).sum()), int((base < 0).sum()), int(explicit)])
-        return cls(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in host), counts)
+        base, ends = np.array(bases, np.int32), np.cumsum([0, *lengths])
+        empty = (np.zeros(0), np.zeros(0), np.zeros((0, PANEL, PANEL)))
+        order, pivot, triangle = (np.concatenate([p[i] for p in parts] or [empty[i]]) for i in range(3))
+        triangles = [_stacked([p[i] for p in parts if len(p) > i]) for i in (3, 4)]
+        host = (base, ends[:-1].astype(np.int32), order.astype(np.int32), pivot.astype(np.float64), triangle)
+        counts = torch.tensor([int((base >= 0).sum()), int((base < 0).sum()), int(explicit), int(ends[-1])])
+        arrays = (*host, *triangles[0], *triangles[1])
+        return cls(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays), counts)
 
     def without(self, load: torch.Tensor, vertex_component: torch.Tensor) -> torch.Tensor:
         """A load [V,3] with zeros on the components that have a factor."""
@@ -145,10 +158,33 @@ def _factored(block: scipy.sparse.csc_matrix, explicit: bool, budget: int, devic
     order[lu.perm_c] = np.arange(count)
     lower = scipy.sparse.tril(lu.L, -1, format="csc")
     lower.sort_indices()
-    if not explicit:
-        return (order, 1.0 / pivots, lower) if lower.nnz <= budget else None
-    inverse = _inverted(block[order][:, order].tocsr(), lower, budget, device)
-    return None if inverse is None else (order, 1.0 / pivots, inverse, inverse.tocsr())
+    if explicit:
+        inverse = _inverted(block[order][:, order].tocsr(), lower, budget, device)
+        if inverse is None:
+            return None
+        by_columns, by_rows = ((m.indptr, m.indices, m.data) for m in (inverse, inverse.tocsr()))
+        return order, 1.0 / pivots, np.zeros((0, PANEL, PANEL)), by_columns, by_rows
+    triangle, panels = _in_panels(lower)
+    if panels[2].size > budget:
+        return None
+    padding = -count % PANEL
+    return np.pad(order, (0, padding), constant_values=-1), np.pad(1.0 / pivots, (0, padding)), triangle, panels
+
+
+def _in_panels(lower: scipy.sparse.csc_matrix) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """A strictly lower matrix [n,n] by panels: triangles [n/4,4,4]; pointers, rows, and values [*,4] below them."""
+    count = -(-lower.shape[0] // PANEL)
+    column = np.repeat(np.arange(lower.shape[1]), np.diff(lower.indptr))
+    row, panel, within = lower.indices.astype(np.int64), column // PANEL, column % PANEL
+    inside = row // PANEL == panel
+    triangle = np.zeros((count, PANEL, PANEL))
+    triangle[panel[inside], row[inside] % PANEL, within[inside]] = lower.data[inside]
+    below = ~inside
+    key, slot = np.unique(panel[below] * (PANEL * count) + row[below], return_inverse=True)
+    values = np.zeros((len(key), PANEL))
+    values[slot, within[below]] = lower.data[below]
+    pointer = np.searchsorted(key // (PANEL * count), np.arange(count + 1))
+    return triangle, (pointer, key % (PANEL * count), values)
 
 
 def _inverted(
@@ -230,13 +266,12 @@ def invert_columns(
             w = inverse_value[slot]
 
 
-def _stacked(blocks: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compressed matrices one after the other: pointers run on, indices stay those of their block."""
-    ends = np.cumsum([0] + [b.nnz for b in blocks])
-    pointer = [b.indptr[1:].astype(np.int64) + end for b, end in zip(blocks, ends[:-1], strict=True)]
-    indices, values = [b.indices for b in blocks], [b.data for b in blocks]
+def _stacked(parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compressed matrices one after the other: pointers run on, indices stay those of their matrix."""
+    ends = np.cumsum([0] + [len(indices) for _, indices, _ in parts])
+    pointer = [p[1:].astype(np.int64) + end for (p, _, _), end in zip(parts, ends[:-1], strict=True)]
     return (
         np.concatenate([[0], *pointer]).astype(np.int32),
-        np.concatenate(indices).astype(np.int32) if blocks else np.zeros(0, np.int32),
-        np.concatenate(values).astype(np.float64) if blocks else np.zeros(0),
+        np.concatenate([p[1] for p in parts] or [np.zeros(0)]).astype(np.int32),
+        np.concatenate([p[2] for p in parts] or [np.zeros(0)]).astype(np.float64),
     )

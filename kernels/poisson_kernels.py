@@ -12,15 +12,6 @@ ISOLATED = wp.constant(2)  # a vertex without faces or pin: stays where it is
 
 
 @wp.func
-def load(matrices: wp.array3d[wp.float32], i: int) -> wp.mat33d:
-    m = wp.mat33d()
-    for r in range(3):
-        for c in range(3):
-            m[r, c] = wp.float64(matrices[i, r, c])
-    return m
-
-
-@wp.func
 def rest_edge(rest_vertices: wp.array[wp.vec3], a: int, b: int) -> wp.vec3d:
     return wp.vec3d(rest_vertices[a]) - wp.vec3d(rest_vertices[b])
 
@@ -28,15 +19,15 @@ def rest_edge(rest_vertices: wp.array[wp.vec3], a: int, b: int) -> wp.vec3d:
 @wp.kernel(enable_backward=False)
 def right_hand_side(
     # Model:
-    faces: wp.array2d[wp.int32],
-    half_cotangent: wp.array2d[wp.float64],
+    faces: wp.array[wp.vec3i],
+    half_cotangent: wp.array[wp.vec3d],
     corner_start: wp.array[wp.int32],
     corners: wp.array[wp.int32],
     corner_edge: wp.array[wp.vec3d],
     pin_of_vertex: wp.array[wp.int32],
     pin_stiffness: wp.array[wp.float64],
     # In:
-    phi: wp.array3d[wp.float32],
+    phi: wp.array[wp.mat33],
     initial: wp.array[wp.vec3d],
     pin_target: wp.array[wp.vec3],
     # Out:
@@ -50,9 +41,11 @@ def right_hand_side(
         i = corners[e] // 3
         k = corners[e] - 3 * i
         j = wp.where(k == 2, 0, k + 1)
-        l = wp.where(k == 0, 2, k - 1)  # w is indexed by the corner opposite to the edge
-        g += load(phi, i) * corner_edge[e]
-        g -= half_cotangent[i, l] * (v - initial[faces[i, j]]) + half_cotangent[i, j] * (v - initial[faces[i, l]])
+        l = wp.where(k == 0, 2, k - 1)
+        f = faces[i]
+        w = half_cotangent[i]  # indexed by the corner opposite to the edge
+        g += wp.mat33d(phi[i]) * corner_edge[e]
+        g -= w[l] * (v - initial[f[j]]) + w[j] * (v - initial[f[l]])
     pin = pin_of_vertex[a]
     if pin >= 0:
         g += pin_stiffness[a] * (wp.vec3d(pin_target[pin]) - v)

@@ -1,6 +1,6 @@
 """A x = b for every component that has a factor (factor.py), with three right-hand sides at once.
 
-By substitution, a component per thread, as a CPU likes it:
+By substitution, a component per thread, four places at a time, as a CPU likes it:
 
     for k upwards:      x_k = b_k - Σ_{j<k} L_kj x_j,    for k downwards:  x_k = x_k / D_k - Σ_{j>k} L_jk x_j
 
@@ -34,39 +34,65 @@ def padded(v: wp.vec3d) -> wp.vec4d:
 
 
 @wp.func
-def eliminate_place(
-    base: int,
+def eliminate(
+    panel: int,
+    place: int,
     first: int,
-    k: int,
-    pivot: wp.array[wp.float64],
+    pivot: wp.array[wp.vec4d],
+    triangle: wp.array[wp.mat44d],
     pointer: wp.array[wp.int32],
-    column: wp.array[wp.int32],
-    value: wp.array[wp.float64],
+    row: wp.array[wp.int32],
+    value: wp.array[wp.vec4d],
     x: wp.array[wp.vec4d],
 ):
-    """One place of the sweep upwards, after which x is D⁻¹ L⁻¹ x."""
-    xk = x[first + k]
-    for e in range(pointer[base + k], pointer[base + k + 1]):
-        j = first + column[e]
-        x[j] = x[j] - value[e] * xk
-    x[first + k] = pivot[base + k] * xk
+    """The sweep upwards at the four places of a panel; after all of them x is D⁻¹ L⁻¹ x."""
+    t = triangle[panel]
+    x0 = x[place]
+    x1 = x[place + 1] - t[1, 0] * x0
+    x2 = x[place + 2] - t[2, 0] * x0 - t[2, 1] * x1
+    x3 = x[place + 3] - t[3, 0] * x0 - t[3, 1] * x1 - t[3, 2] * x2
+    for e in range(pointer[panel], pointer[panel + 1]):
+        j = first + row[e]
+        v = value[e]
+        x[j] = (x[j] - v[0] * x0 - v[1] * x1) - (v[2] * x2 + v[3] * x3)
+    d = pivot[panel]
+    x[place] = d[0] * x0
+    x[place + 1] = d[1] * x1
+    x[place + 2] = d[2] * x2
+    x[place + 3] = d[3] * x3
 
 
 @wp.func
-def substitute_place(
-    base: int,
+def substitute_back(
+    panel: int,
+    place: int,
     first: int,
-    k: int,
+    triangle: wp.array[wp.mat44d],
     pointer: wp.array[wp.int32],
-    column: wp.array[wp.int32],
-    value: wp.array[wp.float64],
+    row: wp.array[wp.int32],
+    value: wp.array[wp.vec4d],
     x: wp.array[wp.vec4d],
 ):
-    """One place of the sweep downwards, after which x is L⁻ᵀ x."""
-    s = x[first + k]
-    for e in range(pointer[base + k], pointer[base + k + 1]):
-        s -= value[e] * x[first + column[e]]
-    x[first + k] = s
+    """The sweep downwards at the four places of a panel; after all of them x is L⁻ᵀ x."""
+    x0 = x[place]
+    x1 = x[place + 1]
+    x2 = x[place + 2]
+    x3 = x[place + 3]
+    for e in range(pointer[panel], pointer[panel + 1]):
+        s = x[first + row[e]]
+        v = value[e]
+        x0 -= v[0] * s
+        x1 -= v[1] * s
+        x2 -= v[2] * s
+        x3 -= v[3] * s
+    t = triangle[panel]
+    x2 -= t[3, 2] * x3
+    x1 -= t[2, 1] * x2 + t[3, 1] * x3
+    x0 -= t[1, 0] * x1 + t[2, 0] * x2 + t[3, 0] * x3
+    x[place] = x0
+    x[place + 1] = x1
+    x[place + 2] = x2
+    x[place + 3] = x3
 
 
 @wp.kernel(enable_backward=False)
@@ -75,11 +101,13 @@ def substitute(
     start: wp.array[wp.int32],
     rows: wp.array[wp.int32],
     base: wp.array[wp.int32],
+    work: wp.array[wp.int32],
     order: wp.array[wp.int32],
-    pivot: wp.array[wp.float64],
+    pivot: wp.array[wp.vec4d],
+    triangle: wp.array[wp.mat44d],
     pointer: wp.array[wp.int32],
-    column: wp.array[wp.int32],
-    value: wp.array[wp.float64],
+    row: wp.array[wp.int32],
+    value: wp.array[wp.vec4d],
     # In:
     rhs: wp.array[wp.vec3d],
     # Work:
@@ -91,17 +119,24 @@ def substitute(
     component = wp.tid()
     b = base[component]
     if b >= 0:
-        first = start[component]
-        size = start[component + 1] - first
-        for k in range(size):
-            x[first + k] = padded(rhs[rows[first + order[b + k]]])
-        for k in range(size):
-            eliminate_place(b, first, k, pivot, pointer, column, value, x)
-        for m in range(size):
-            k = size - 1 - m
-            substitute_place(b, first, k, pointer, column, value, x)
-            v = x[first + k]
-            solution[rows[first + order[b + k]]] = wp.vec3d(v[0], v[1], v[2])
+        begin = start[component]
+        first = work[component]
+        panels = (start[component + 1] - begin + 3) / 4
+        for k in range(4 * panels):
+            v = order[b + k]
+            x[first + k] = wp.vec4d()
+            if v >= 0:
+                x[first + k] = padded(rhs[rows[begin + v]])
+        for q in range(panels):
+            eliminate(b / 4 + q, first + 4 * q, first, pivot, triangle, pointer, row, value, x)
+        for m in range(panels):
+            q = panels - 1 - m
+            substitute_back(b / 4 + q, first + 4 * q, first, triangle, pointer, row, value, x)
+        for k in range(4 * panels):
+            v = order[b + k]
+            if v >= 0:
+                d = x[first + k]
+                solution[rows[begin + v]] = wp.vec3d(d[0], d[1], d[2])
 
 
 @wp.kernel(enable_backward=False)
@@ -190,28 +225,38 @@ def solve(
     if len(rhs) == 0 or not int(factor.counts[0]):
         return
     common = [cg.view(system.start, wp.int32), cg.view(system.rows, wp.int32)]
-    base, order = cg.view(factor.base, wp.int32), cg.view(factor.order, wp.int32)
-    pivot = cg.view(factor.pivot, wp.float64)
-    columns = [
-        cg.view(factor.pointer, wp.int32),
-        cg.view(factor.column, wp.int32),
-        cg.view(factor.value, wp.float64),
-    ]
     load, result = cg.view(rhs, wp.vec3d), cg.view(solution, wp.vec3d)
     with torch_stream(rhs.device) as device:
         if not int(factor.counts[2]):
-            work = cg.view(allocate((len(rhs), 4), torch.float64, rhs.device), wp.vec4d)
-            inputs = [*common, base, order, pivot, *columns, load, work, result]
+            work = cg.view(allocate((int(factor.counts[3]), 4), torch.float64, rhs.device), wp.vec4d)
+            inputs = [*common, *substitution(factor), load, work, result]
             wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
             return
-        rows = [
-            cg.view(factor.row_pointer, wp.int32),
-            cg.view(factor.row_column, wp.int32),
-            cg.view(factor.row_value, wp.float64),
-        ]
+        base, order = cg.view(factor.base, wp.int32), cg.view(factor.order, wp.int32)
+        columns, rows = (
+            [cg.view(pointer, wp.int32), cg.view(column, wp.int32), cg.view(value, wp.float64)]
+            for pointer, column, value in (
+                (factor.pointer, factor.column, factor.value),
+                (factor.row_pointer, factor.row_column, factor.row_value),
+            )
+        )
         common += [cg.view(vertex_component, wp.int32), base, order]
         work = cg.view(allocate(rhs.shape, torch.float64, rhs.device), wp.vec3d)
         block = LANES if rhs.is_cuda else cg.block_dim(rhs.device, len(rhs), 1)
-        first, second = [*common, pivot, *rows, load, work], [*common, *columns, work, result]
+        first = [*common, cg.view(factor.pivot, wp.float64), *rows, load, work]
+        second = [*common, *columns, work, result]
         wp.launch_tiled(multiply_lower, dim=[len(rhs)], inputs=first, block_dim=block, device=device)
         wp.launch_tiled(multiply_upper, dim=[len(rhs)], inputs=second, block_dim=block, device=device)
+
+
+def substitution(factor: Factor) -> list[object]:
+    """A factor in the form for substitution as launch arguments, `base` to `value` of `substitute`."""
+    integers = [cg.view(t, wp.int32) for t in (factor.base, factor.first, factor.order)]
+    return [
+        *integers,
+        cg.view(factor.pivot.view(-1, 4), wp.vec4d),
+        cg.view(factor.triangle, wp.mat44d),
+        cg.view(factor.pointer, wp.int32),
+        cg.view(factor.column, wp.int32),
+        cg.view(factor.value.view(-1, 4), wp.vec4d),
+    ]

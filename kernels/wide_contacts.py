@@ -25,6 +25,7 @@ from ._torch import torch_stream
 from .compliance import Compliance
 
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
+wp.set_module_options({"max_unroll": 1})  # loops over sixteen would be compiled sixteen times, for nothing
 
 
 @wp.kernel(enable_backward=False)
