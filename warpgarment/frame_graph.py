@@ -80,6 +80,11 @@ class GraphedFrames:
         self.scene.placed = next_body  # the graph has moved the bodies' search trees there
         return type(now)(*(tensor.clone() for tensor in after))._replace(body=next_body)
 
+    @property
+    def recorded(self) -> bool:
+        """Whether frames are replayed from now on."""
+        return self._recorded is not None
+
     def _record(self, now: Frame, next_body: torch.Tensor) -> bool:
         before, body = type(now)(*(tensor.clone() for tensor in now)), next_body.clone()
         self.scene.bodies(now.body)
