@@ -21,8 +21,18 @@ Row = dict[str, Any]
 Call = Callable[[], object]
 
 
-def interleaved(calls: dict[str, Call], device: torch.device, seconds: float, least: int = 3) -> dict[str, list[float]]:
+class Times(list[float]):
+    """Milliseconds of each call: of the processor on a CPU, by the clock on a GPU; `wall` is by the clock for both."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wall: list[float] = []
+
+
+def interleaved(calls: dict[str, Call], device: torch.device, seconds: float, least: int = 3) -> dict[str, Times]:
     """Times of calls that take turns, so that what else the machine does disturbs all of them [ms].
+
+    On a CPU the processor's time is taken, all threads together: what a call costs on one core, whoever else is there.
 
     Args:
         calls: By name. Each runs once before, unless that alone took `seconds`.
@@ -31,31 +41,38 @@ def interleaved(calls: dict[str, Call], device: torch.device, seconds: float, le
         least: but at least so many, and at most 200.
     """
 
-    def timed(call: Call) -> float:
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        began = time.perf_counter()
-        call()
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        return 1e3 * (time.perf_counter() - began)
+    spent = {name: Times() for name in calls}
 
-    spent = {name: [timed(call)] for name, call in calls.items()}
-    began = time.perf_counter()
-    cold = {name for name in calls if spent[name][0] < 1e3 * seconds}
-    rounds = 0
+    def take(name: str) -> None:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        began, worked = time.perf_counter(), time.process_time()
+        calls[name]()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        wall, work = time.perf_counter() - began, time.process_time() - worked
+        spent[name].wall.append(1e3 * wall)
+        spent[name].append(1e3 * (wall if device.type == "cuda" else work))
+
+    for name in calls:
+        take(name)
+        if spent[name].wall[0] < 1e3 * seconds:  # it warmed up
+            spent[name].clear()
+            spent[name].wall.clear()
+    began, rounds = time.perf_counter(), 0
     while rounds < 200 and (rounds < least or time.perf_counter() - began < seconds * len(calls)):
-        for name, call in calls.items():
-            spent[name].append(timed(call))
+        for name in calls:
+            take(name)
         rounds += 1
         if time.perf_counter() - began > 4 * seconds * len(calls):
             break
-    return {name: times[1:] if name in cold and len(times) > 1 else times for name, times in spent.items()}
+    return spent
 
 
-def figures(times: list[float], share: float = 1.0) -> Row:
+def figures(times: Times, share: float = 1.0) -> Row:
     """Least and median of times [ms], times a share (one over the garments of a batch, say)."""
-    return {"min_ms": share * min(times), "median_ms": share * statistics.median(times), "runs": len(times)}
+    least, median = share * min(times), share * statistics.median(times)
+    return {"min_ms": least, "median_ms": median, "wall_ms": share * min(times.wall), "runs": len(times)}
 
 
 def compared(

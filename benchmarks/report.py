@@ -28,7 +28,10 @@ INTRODUCTIONS = {
 def markdown(about: dict[str, str], command: str, rows: Sequence[Row]) -> str:
     """The results as tables, a part each."""
     lines = ["# " + ", ".join(f"{k} {v}" for k, v in about.items()), "", f"`{command}`", ""]
-    lines += ["Milliseconds: least, and median. Rows that were not run say why.", ""]
+    lines += [
+        "Milliseconds, least and median: of the processor on a CPU, all threads together; by the clock on a GPU.",
+        "",
+    ]
     for part, title in TITLES.items():
         mine = [row for row in rows if row["part"] == part]
         if not mine:
@@ -142,8 +145,9 @@ def _ratios(axis, rows: Sequence[Row]) -> None:
             f"{row['what'].split(',')[0]}\n{row['reference']}": row["ratio"] for row in rows if row["faces"] == size
         }
         at = [i + 0.8 * (k + 0.5) / len(sizes) - 0.4 for i, name in enumerate(names) if name in found]
-        axis.barh(at, [found[n] for n in names if n in found], 0.8 / len(sizes), label=f"{size:,} faces")
+        axis.plot([found[n] for n in names if n in found], at, "o", markersize=5, label=f"{size:,} faces")
     axis.set_yticks(range(len(names)), names, fontsize=6)
+    axis.grid(axis="x", alpha=0.3)
     axis.invert_yaxis()
     axis.set_xscale("log")
     axis.axvline(1.0, color="black", linewidth=0.8)
@@ -183,7 +187,8 @@ def _roofs(axis, rows: Sequence[Row]) -> None:
         at = [row["operations"] / row["bytes"] for row in mine]
         axis.scatter(at, [row["rate"] / 1e9 for row in mine], color=colour, s=18)
         for x, row in zip(at, mine, strict=True):
-            axis.annotate(f"{row['faces']:,} x {row['batch']}", (x, row["rate"] / 1e9), fontsize=5)
+            place = {"xytext": (4, -8), "textcoords": "offset points", "fontsize": 5, "color": colour}
+            axis.annotate(f"{row['faces']:,} x {row['batch']}", (x, row["rate"] / 1e9), **place)
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_xlabel("operations per byte")
