@@ -1,91 +1,103 @@
-"""Times every stage against a reference in the same run, and writes a table.
+"""Times everything against a reference in the same run, for the device at hand; writes JSON, a table and a plot.
 
-    python -m benchmarks                     # the device at hand
-    python -m benchmarks --faces 1000 2000   # other garment sizes
+    python -m benchmarks                               # all parts, about ten minutes on one core
+    python -m benchmarks --quick                       # fewer sizes, one or two minutes
+    python -m benchmarks --only stages roofline
+    python -m benchmarks --faces 1000 --batch 1 8      # other sizes and batches
 
-References: libigl for signed distances, SciPy's SuperLU for the two linear systems (prefactored for Poisson, factored
-in every call for the refinement, as the paper does it), NumPy for deformation gradients. Each figure is the median of
-several calls; the ratio is reference time over ours. Results: benchmarks/results/<device>.json and .md.
+Parts: `stages` each kernel beside the published way; `batch` whole frames, packed and one by one; `roofline` the
+network beside the device's own rates; `teacher` whole frames beside Newton's VBD; `profile` launches and waits within a
+frame. A CPU is measured on one thread. Calls that are compared take turns. Results: benchmarks/results/<device>.json,
+.md and .png. Needs the extras `physics` and `train`.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
+import itertools
 import json
-import platform
-import statistics
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import torch
 
-from . import stages, step
+from warpgarment.io.atomic import atomic_files
 
-RESULTS = Path(__file__).parent / "results"
+from . import batch, frames, report, roofline, stages, teacher
+from .measure import RESULTS, Row, machine
 
-
-def median_ms(call: Callable[[], object], device: torch.device, repeats: int = 9) -> float:
-    """Median time of a call [ms], after two calls to warm up."""
-
-    def finish() -> None:
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-
-    times = []
-    for number in range(repeats + 2):
-        finish()
-        began = time.perf_counter()
-        call()
-        finish()
-        if number >= 2:
-            times.append(1e3 * (time.perf_counter() - began))
-    return statistics.median(times)
+PARTS = ("stages", "batch", "roofline", "teacher", "profile")
+FACES = (500, 1000, 2000, 5000, 10000)
+QUICK = (500, 2000)
 
 
-def machine(device: torch.device) -> dict[str, str]:
-    """What the figures were measured on."""
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
-    packages = ("warpgarment", "warp-lang", "torch", "numpy", "scipy", "libigl")
-    versions = {n: importlib.metadata.version(n) for n in packages}
-    return {"device": name, "torch threads": str(torch.get_num_threads()), **versions}
+def measured(options: argparse.Namespace, device: torch.device) -> Iterator[Row]:
+    """All rows of the parts that were asked for."""
+    seconds = 0.15 if options.quick else 0.5
+    if "stages" in options.only:
+        yield from itertools.chain.from_iterable(stages.rows(n, device, seconds) for n in options.faces)
+    if "batch" in options.only:
+        yield from batch.rows(options.faces, options.batch, device, options.weights, seconds)
+    if "roofline" in options.only:
+        sizes = options.faces if options.quick or device.type == "cuda" else options.faces[:4]
+        yield from roofline.rows(sizes, options.batch[:: len(options.batch) - 1 or 1], device, options.weights, seconds)
+    if "teacher" in options.only:
+        yield from teacher.against(options.faces[:2], device, options.weights, 3 if options.quick else 6)
+    if "profile" in options.only:
+        yield from frames.rows(options.faces[0], (1, 2, 8), device, options.weights)
 
 
-def main() -> None:
-    """Runs all benchmarks."""
+def shown(rows: Iterable[Row]) -> Iterator[Row]:
+    """Prints rows as they come."""
+    began = time.perf_counter()
+    for row in rows:
+        where = " ".join(f"{row[key]:>6,} {key}" for key in ("faces", "batch") if key in row)
+        if "note" in row:
+            said = f"{row.get('reference', '')} {row['note']}".strip()
+        elif "median_ms" in row:
+            said = f"{row.get('min_ms', row['median_ms']):10.2f} ms"
+            said += f"   {row['ratio']:8.2f} x {row['reference']}" if "ratio" in row else ""
+            said += f"   {row['achieved']:.0%} of the roofline" if "achieved" in row else ""
+        else:
+            said = ", ".join(f"{k} {v:g}" for k, v in row.items() if isinstance(v, (int, float)) and k not in where)
+        print(f"{time.perf_counter() - began:6.0f} s  {where:<22} {row['what']:<36} {said}", flush=True)
+        yield row
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs what was asked for and writes the results."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--faces", type=int, nargs="+", default=[1000, 2000, 5000])
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run")
+    parser.add_argument("--faces", type=int, nargs="+", help="sizes of the garment")
+    parser.add_argument("--batch", type=int, nargs="+", help="garments at once")
+    parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--weights", default="default")
-    options = parser.parse_args()
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
+    options = parser.parse_args(arguments)
     device = torch.device(options.device)
+    options.faces = options.faces or list(QUICK if options.quick else FACES)
+    everything = batch.CPU_BATCH if device.type == "cpu" else batch.GPU_BATCH
+    options.batch = options.batch or list(everything[:3] if options.quick else everything)
     if device.type == "cpu":
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
         torch.set_num_threads(1)
-    rows = []
-    for faces in options.faces:
-        for row in (*stages.rows(faces, device, median_ms), *step.rows(faces, device, options.weights)):
-            rows.append(row)
-            reference = f"{row['reference_ms']:.2f} ms {row['reference']}" if row.get("reference_ms") else "-"
-            print(f"{row['faces']:>6,} faces  {row['stage']:<34} {row['ms']:>8.2f} ms   {reference}", flush=True)
-    RESULTS.mkdir(exist_ok=True)
+    began = time.perf_counter()
+    rows = list(shown(measured(options, device)))
+    command = f"python -m benchmarks --device {device.type} --only {' '.join(options.only)}"
+    command += f" --faces {' '.join(map(str, options.faces))} --batch {' '.join(map(str, options.batch))}"
+    command += f" --weights {options.weights}{' --quick' if options.quick else ''}"
     about = machine(device)
-    target = RESULTS / device.type
-    target.with_suffix(".json").write_text(json.dumps({"machine": about, "rows": rows}, indent=1))
-    target.with_suffix(".md").write_text(markdown(about, rows))
-    print(f"written {target.relative_to(Path.cwd()) if target.is_relative_to(Path.cwd()) else target}.md")
-
-
-def markdown(about: dict[str, str], rows: list[dict]) -> str:
-    """The results as a table."""
-    lines = ["# " + ", ".join(f"{k} {v}" for k, v in about.items()), ""]
-    lines += ["`python -m benchmarks`, medians. Ratio: reference time over ours.", ""]
-    lines += ["| faces | stage | ms | reference | ms | ratio |", "| ---: | --- | ---: | --- | ---: | ---: |"]
-    for row in rows:
-        reference = row.get("reference_ms")
-        compared = f"{row['reference']} | {reference:.2f} | {reference / row['ms']:.1f}" if reference else "- | - | -"
-        lines.append(f"| {row['faces']:,} | {row['stage']} | {row['ms']:.2f} | {compared} |")
-    return "\n".join(lines) + "\n"
+    target = options.out / device.type
+    spent = round(time.perf_counter() - began)
+    files = [target.with_suffix(suffix) for suffix in (".json", ".md", ".png")]
+    with atomic_files(*files) as (data, table, picture):
+        data.write_text(json.dumps({"machine": about, "command": command, "seconds": spent, "rows": rows}, indent=1))
+        table.write_text(report.markdown(about, command, rows))
+        report.plot(picture, about, rows)
+    print(f"written {target}.json, .md and .png")
 
 
 if __name__ == "__main__":

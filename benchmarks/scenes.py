@@ -27,10 +27,9 @@ class Dressed:
 
 
 @lru_cache(maxsize=8)
-def dressed(faces: int, name: str = "dress", start: int = 40) -> Dressed:
-    """The bundled garment with about `faces` faces, carried along by barycentric coordinates."""
-    bundle = demo.assets()
-    item = bundle.garments[name]
+def remeshed(faces: int, name: str = "dress") -> tuple[Garment, np.ndarray, np.ndarray]:
+    """The bundled garment with about `faces` faces; the old face and the barycentric coordinates of each new vertex."""
+    item = demo.assets().garments[name]
     rest, old = item.garment.vertices.astype(np.float64), item.garment.faces.astype(np.int64)
     area = 0.5 * np.asarray(igl.doublearea(rest, old)).sum()
     edge = float(np.sqrt(area * 4.0 / (np.sqrt(3.0) * faces)))
@@ -39,6 +38,17 @@ def dressed(faces: int, name: str = "dress", start: int = 40) -> Dressed:
     _, nearest, closest = igl.point_mesh_squared_distance(vertices, rest, old)
     corners = [rest[old[nearest, k]] for k in range(3)]
     weights = np.asarray(igl.barycentric_coordinates(closest, *corners)).reshape(-1, 3)
+    garment = Garment(vertices.astype(np.float32), triangles.astype(np.int32), name=f"{name}_{faces}")
+    return garment, nearest, weights
+
+
+@lru_cache(maxsize=64)
+def dressed(faces: int, name: str = "dress", start: int = 40) -> Dressed:
+    """The bundled garment with about `faces` faces on the body from a frame of the walk on."""
+    garment, nearest, weights = remeshed(faces, name)
+    bundle = demo.assets()
+    item = bundle.garments[name]
+    old = item.garment.faces.astype(np.int64)
 
     def carried(frame: np.ndarray) -> np.ndarray:
         return np.einsum("vk,vkc->vc", weights, frame.astype(np.float64)[old[nearest]]).astype(np.float32)
@@ -57,5 +67,4 @@ def dressed(faces: int, name: str = "dress", start: int = 40) -> Dressed:
     inward /= np.linalg.norm(inward, axis=1, keepdims=True) + 1e-12
     depth = np.minimum(np.asarray(distance), 0.03)[:, None] + 0.006
     pressed = (first + np.where(near, inward * depth, 0.0)).astype(np.float32)
-    garment = Garment(vertices.astype(np.float32), triangles.astype(np.int32), name=f"{name}_{faces}")
     return Dressed(garment, moving, first, second, pressed)

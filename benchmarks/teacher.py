@@ -25,9 +25,11 @@ import numpy as np
 import torch
 
 from warpgarment.io.atomic import atomic_files
+from warpgarment.simulator import Simulator
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, TeacherError, make_teacher
 
-from .__main__ import RESULTS, machine
+from .batch import Rolling, scenes_of
+from .measure import RESULTS, Row, figures, interleaved, machine
 from .scenes import dressed
 
 WORLDS = {"cpu": (1, 4), "cuda": (1, 4, 16, 64, 256, 1024)}
@@ -75,6 +77,26 @@ def rows(teacher: str, device: str, sizes: list[int], worlds: list[int], frames:
                 "frames_per_s": round(number / each, 2),
                 "frames_per_hour": round(3600.0 * number / each),
             }
+
+
+def against(faces: list[int], device: torch.device, weights: str, frames: int) -> Iterator[Row]:
+    """Whole frames of the simulator and of Newton's VBD, the same garment on the same body, one at a time."""
+    simulator = Simulator.from_pretrained(weights, device=device)
+    for size in faces:
+        scene = world(size, frames + 1, 32)
+        base = {"part": "teacher", "what": "whole frame", "faces": len(scene.cloths[0].garment.faces), "batch": 1}
+        try:
+            stream = make_teacher("newton", str(device)).simulate_many([scene])
+            next(stream)
+        except TeacherError as error:
+            yield base | {"reference": "Newton VBD", "note": str(error).splitlines()[0]}
+            continue
+        rolling = Rolling(simulator, scenes_of([size], 1))
+        times = interleaved({"": rolling, "VBD": lambda s=stream: next(s, None)}, device, 0.0, frames - 1)
+        mine = figures(times[""])
+        theirs = {f"reference_{key}": value for key, value in figures(times["VBD"]).items()}
+        reference = {"reference": "Newton VBD, 10 substeps of 5 iterations"}
+        yield base | mine | reference | theirs | {"ratio": theirs["reference_min_ms"] / mine["min_ms"]}
 
 
 def settings(teacher: str) -> dict[str, Any]:

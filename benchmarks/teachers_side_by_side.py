@@ -32,7 +32,7 @@ from warpgarment.motion import GarmentMotion
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, make_teacher
 from warpgarment.training.teachers.checks import hanging_strip, pendulum, rest_on_sphere
 
-from .__main__ import machine
+from .measure import machine
 
 RESULTS = Path(__file__).parent / "results"
 WIDER = 0.020  # gap between the T-shirt and the one over it [m]

@@ -39,7 +39,7 @@ def cuda_graph(run: Callable[[], Frame]) -> tuple[Frame, Callable[[], None]]:
         The tensors that a replay fills in, and the replay.
     """
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+    with torch.cuda.graph(graph, stream=torch.cuda.Stream(), capture_error_mode="thread_local"):
         stream = wp.stream_from_torch(torch.cuda.current_stream())
         with wp.ScopedCapture(stream=stream, external=True) as capture:
             after = run()
@@ -80,12 +80,18 @@ class GraphedFrames:
         self.scene.placed = next_body  # the graph has moved the bodies' search trees there
         return type(now)(*(tensor.clone() for tensor in after))._replace(body=next_body)
 
+    @property
+    def recorded(self) -> bool:
+        """Whether frames are replayed from now on."""
+        return self._recorded is not None
+
     def _record(self, now: Frame, next_body: torch.Tensor) -> bool:
         before, body = type(now)(*(tensor.clone() for tensor in now)), next_body.clone()
         self.scene.bodies(now.body)
         self.scene.placed = before.body  # where a replay finds them
         try:
-            after, replay = self.record(lambda: self.advance(before, body))
+            with torch.cuda.device_of(now.positions):  # nothing where that is no GPU
+                after, replay = self.record(lambda: self.advance(before, body))
         except Exception as error:  # whatever CUDA, torch or Warp refuse to capture
             self.failed = True
             reason = str(error).strip().splitlines() or [""]

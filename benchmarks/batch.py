@@ -1,0 +1,139 @@
+"""Whole frames: batches of garments, packed, against the same garments one by one in a Python loop."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator, Sequence
+
+import torch
+
+from warpgarment import memory
+from warpgarment.errors import NotEnoughMemory
+from warpgarment.garment import Garment
+from warpgarment.simulator import Simulator
+from warpgarment.state import SimulationState
+
+from .measure import NO_GPU, Row, figures, interleaved
+from .scenes import Dressed, dressed
+
+CPU_BATCH = (1, 2, 4, 8, 16)
+GPU_BATCH = (1, 4, 16, 64, 256, 1024, 4096)
+LOOP = 16  # largest batch that is also simulated one by one
+START, STARTS = 40, 8  # frames of the walk at which bodies of a batch begin
+WALK = 12  # frames, there and back
+LONGEST = 12.0  # seconds that a frame may take, by the batch before it
+
+
+class Rolling:
+    """A simulation that can be asked for the next frame again and again: the bodies walk, and walk back.
+
+    On a GPU the bodies lie there beforehand: how fast a host can send them is another question.
+    """
+
+    def __init__(self, simulator: Simulator, scenes: Sequence[Dressed]) -> None:
+        self.simulator = simulator
+        self.bodies = [scene.body for scene in scenes]
+        frames = min(WALK, *(body.frames for body in self.bodies))
+        self.order = itertools.cycle([*range(1, frames), *range(frames - 2, -1, -1)])
+        garments, first = [scene.garment for scene in scenes], [scene.first for scene in scenes]
+        shapes, faces = [body.vertices[0] for body in self.bodies], [body.faces for body in self.bodies]
+        self.state: SimulationState = simulator.start(garments, shapes, faces, first_vertices=first)
+        self.sent: list[torch.Tensor] = []
+        if simulator.device.type == "cuda":
+            walk = [[body.vertices[frame] for body in self.bodies] for frame in range(frames)]
+            self.sent = [simulator._positions(positions) for positions in walk]
+
+    def __call__(self) -> None:
+        """One frame."""
+        frame = next(self.order)
+        if self.sent:
+            self.state = self.simulator._advance(self.state, self.sent[frame])
+        else:
+            self.state = self.simulator.step(self.state, [body.vertices[frame] for body in self.bodies])
+
+
+def scenes_of(sizes: Sequence[int], number: int) -> list[Dressed]:
+    """Garments of these sizes in turn, on bodies that begin at different frames of the walk."""
+    return [dressed(sizes[k % len(sizes)], start=START + k % STARTS) for k in range(number)]
+
+
+def rows(
+    faces: Sequence[int], batches: Sequence[int], device: torch.device, weights: str, seconds: float
+) -> Iterator[Row]:
+    """Milliseconds per garment and frame: each size alone in a batch, then all sizes mixed, and frames by stage."""
+    simulator = Simulator.from_pretrained(weights, device=device)
+    for size in faces:
+        yield from _series([size], batches, simulator, seconds)
+        yield from _stages(size, simulator)
+    if len(faces) > 1:
+        yield from _series(list(faces[:3]), [b for b in batches if b > 1], simulator, seconds)
+    if device.type == "cpu":
+        for number in GPU_BATCH:
+            yield {"part": "batch", "what": "frame per garment", "device": "cuda", "batch": number, "note": NO_GPU}
+
+
+def _series(sizes: Sequence[int], batches: Sequence[int], simulator: Simulator, seconds: float) -> Iterator[Row]:
+    device, each = simulator.device, 0.0
+    for number in batches:
+        scenes = scenes_of(sizes, number)
+        garments: list[Garment] = [scene.garment for scene in scenes]
+        mean = round(sum(len(g.faces) for g in garments) / number)
+        what = "frame per garment" if len(sizes) == 1 else "frame per garment, mixed sizes"
+        base = {"part": "batch", "what": what, "device": device.type, "faces": mean, "batch": number}
+        if each * number > LONGEST:
+            yield base | {"note": f"not run: a frame would take some {each * number:.0f} s"}
+            continue
+        try:
+            packed = Rolling(simulator, scenes)
+        except NotEnoughMemory as error:
+            yield base | {"note": f"not run: {str(error).split(':')[0]}"}
+            return
+        except torch.cuda.OutOfMemoryError:
+            yield base | {"note": "not run: out of memory, which was not predicted"}
+            return
+        need = memory.predict(garments, [scene.body for scene in scenes], simulator.network.config, device=device)
+        calls = {"packed": _block(packed, device)}
+        if 1 < number <= LOOP and each * number < LONGEST / 4:
+            alone = [_block(Rolling(simulator, [scene]), device) for scene in scenes]
+            calls["loop"] = lambda alone=alone: [call() for call in alone]
+        began = time.perf_counter()
+        times = interleaved(calls, device, seconds)
+        each = min(times["packed"]) / _frames(device) / number / 1e3
+        row = base | figures(times["packed"], 1.0 / number / _frames(device)) | {"memory_mb": need.total / 1e6}
+        if "loop" in calls:
+            theirs = figures(times["loop"], 1.0 / number / _frames(device))
+            row |= {"reference": "Python loop over garments"}
+            row |= {f"reference_{key}": value for key, value in theirs.items()}
+            row["ratio"] = theirs["min_ms"] / row["min_ms"]
+        row["spent_s"] = round(time.perf_counter() - began, 1)
+        yield row
+
+
+def _stages(size: int, simulator: Simulator) -> Iterator[Row]:
+    """Where the time of a frame goes, for one garment; the mean of a few frames."""
+    rolling = Rolling(simulator, scenes_of([size], 1))
+    simulator.timings.synchronise = True
+    rolling()
+    simulator.timings.clear()
+    frames = 4
+    for _ in range(frames):
+        rolling()
+    simulator.timings.synchronise = False
+    count = len(dressed(size).garment.faces)
+    for stage, seconds in simulator.timings.items():
+        mean = 1e3 * seconds / frames
+        yield {"part": "batch", "what": f"stage of a frame: {stage}", "faces": count, "batch": 1, "median_ms": mean}
+
+
+def _frames(device: torch.device) -> int:
+    """Frames per timed call: a GPU is not waited for between them."""
+    return 1 if device.type == "cpu" else 16
+
+
+def _block(rolling: Rolling, device: torch.device):
+    def run() -> None:
+        for _ in range(_frames(device)):
+            rolling()
+
+    return run

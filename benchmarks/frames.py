@@ -1,0 +1,140 @@
+"""What happens within a frame: launches, operators, and whether the host waits for the device."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from unittest import mock
+
+import torch
+import warp as wp
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from warpgarment.frame import advance
+from warpgarment.frame_graph import WARM_UP
+from warpgarment.kernels import cg
+from warpgarment.simulator import Simulator
+
+from .batch import Rolling, scenes_of
+from .measure import NO_GPU, Row
+
+READS = {"_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero"}  # the host waits for these
+VIEWS = {"view", "unsqueeze", "expand", "slice", "select", "t", "transpose", "split", "split_with_sizes", "alias"}
+VIEWS |= {"_unsafe_view", "permute", "squeeze", "as_strided", "detach", "unbind", "lift_fresh", "_reshape_alias"}
+FRAMES = 8  # in the profile of a GPU
+WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
+LAUNCHES = ("cudaLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernel", "cuLaunchKernelEx")
+
+
+class Operators(TorchDispatchMode):
+    """Counts torch operators, views left out, and lists the tensors that the host would wait for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+        self.read: list[tuple[str, torch.Tensor]] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        """Runs the operator."""
+        name = func._schema.name.split("::")[1]
+        if name not in VIEWS:
+            self.counts[name] += 1
+        indices = args[1] if name.startswith(("index", "_index")) and len(args) > 1 else ()
+        by_mask = isinstance(indices, (list, tuple)) and any(i is not None and i.dtype == torch.bool for i in indices)
+        if name in READS or by_mask:
+            self.read.append((name, args[0]))
+        return func(*args, **(kwargs or {}))
+
+
+class FrameCounts:
+    """Counts what one frame does when every decision is left to the device, on whichever device.
+
+    Attributes:
+        operators: Torch's.
+        launches: Warp's, by kernel; `refit` is one per body.
+        reads: Operators whose result the host would wait for.
+    """
+
+    def __init__(self, scene, now, next_body: torch.Tensor) -> None:
+        self.launches: Counter[str] = Counter()
+        early, scene.early_exit = scene.early_exit, False
+        patches = [mock.patch.object(wp, name, self._counted(getattr(wp, name))) for name in ("launch", "launch_tiled")]
+        refit = wp.Mesh.refit
+
+        def counted_refit(mesh: wp.Mesh) -> None:
+            self.launches["refit"] += 1
+            refit(mesh)
+
+        patches.append(mock.patch.object(wp.Mesh, "refit", counted_refit))
+        patches.append(mock.patch.object(cg.Progress, "_warn", return_value=None))  # a CPU looks at reports at once
+        try:
+            for patch in patches:
+                patch.start()
+            with torch.inference_mode(), Operators() as found:
+                advance(scene, now, next_body)
+        finally:
+            for patch in patches:
+                patch.stop()
+            scene.early_exit = early
+        self.operators = found.counts
+        # sizes of the compliance matrices lie on the host
+        self.reads = [name for name, tensor in found.read if tensor.dtype != torch.int64 or tensor.numel() != 1]
+
+    def _counted(self, original):
+        def counted(kernel, *args, **options):
+            self.launches[kernel.key] += 1
+            return original(kernel, *args, **options)
+
+        return counted
+
+
+def rows(faces: int, batches: Sequence[int], device: torch.device, weights: str) -> Iterator[Row]:
+    """Counts per frame for each batch; on a GPU also what torch's profiler saw of frames with and without a graph."""
+    simulator = Simulator.from_pretrained(weights, device=device)
+    for number in batches:
+        scenes = scenes_of([faces], number)
+        rolling = Rolling(simulator, scenes)
+        rolling()
+        bodies = simulator._positions([scene.body.vertices[2] for scene in scenes])
+        found = FrameCounts(rolling.state.scene, rolling.state.now, bodies)
+        refits = found.launches.pop("refit", 0)
+        yield {
+            "part": "profile",
+            "what": "one frame, counted",
+            "faces": len(scenes[0].garment.faces),
+            "batch": number,
+            "warp_launches": sum(found.launches.values()),
+            "torch_operators": sum(found.operators.values()),
+            "refits": refits,
+            "host_reads": len(found.reads),
+        }
+    for graph in (False, True):
+        base = {"part": "profile", "what": f"frames {'as a CUDA graph' if graph else 'without a graph'}, profiled"}
+        if device.type != "cuda":
+            yield base | {"note": NO_GPU}
+            continue
+        for number in batches:
+            yield base | {"batch": number} | _profiled(faces, number, device, weights, graph)
+
+
+def _profiled(faces: int, number: int, device: torch.device, weights: str, graph: bool) -> Row:
+    """Calls of the CUDA runtime per frame, as the profiler saw them."""
+    rolling = Rolling(Simulator.from_pretrained(weights, device=device, graph=graph), scenes_of([faces], number))
+    for _ in range(WARM_UP + 2):
+        rolling()
+    torch.cuda.synchronize(device)
+    activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=activities) as profile:
+        for _ in range(FRAMES):
+            rolling()
+    seen = {event.key: event.count / FRAMES for event in profile.key_averages()}
+    torch.cuda.synchronize(device)
+    recorded = rolling.state.scene.graph is not None and rolling.state.scene.graph.recorded
+    return {
+        "faces": len(rolling.state.scene.packed.faces) // number,
+        "graph": recorded,
+        "synchronisations": sum(seen.get(name, 0.0) for name in WAITS),
+        "launches": sum(seen.get(name, 0.0) for name in LAUNCHES),
+        "graph_launches": seen.get("cudaGraphLaunch", 0.0),
+        "copies": sum(count for name, count in seen.items() if name.startswith("cudaMemcpy")),
+    }

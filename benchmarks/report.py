@@ -1,0 +1,200 @@
+"""The results as a table and as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .measure import Row
+
+TITLES = {
+    "stages": "Stages against the published way",
+    "batch": "Whole frames, per garment",
+    "roofline": "The network against the device",
+    "teacher": "Whole frames against the teacher",
+    "profile": "Within a frame",
+}
+INTRODUCTIONS = {
+    "stages": "Ratio: least time of the reference over ours; references run on the CPU.",
+    "batch": "Garments on bodies of their own. Ratio: a Python loop over the garments over the batch, in the same run.",
+    "roofline": "Achieved: the least time that the measured rates allow, over the least time measured.",
+    "teacher": "Ratio: least time of Newton's VBD over ours.",
+    "profile": "Counted with all decisions left to the device. Host reads are what a GPU would be waited for.",
+}
+
+
+def markdown(about: dict[str, str], command: str, rows: Sequence[Row]) -> str:
+    """The results as tables, a part each."""
+    lines = ["# " + ", ".join(f"{k} {v}" for k, v in about.items()), "", f"`{command}`", ""]
+    lines += [
+        "Milliseconds, least and median: of the processor on a CPU, all threads together; by the clock on a GPU.",
+        "",
+    ]
+    for part, title in TITLES.items():
+        mine = [row for row in rows if row["part"] == part]
+        if not mine:
+            continue
+        lines += [f"## {title}", "", INTRODUCTIONS[part], ""]
+        if part == "profile":
+            lines += _profile(mine)
+        elif part == "roofline":
+            lines += _roofline(mine)
+        else:
+            lines += _times(mine, part != "stages")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _times(rows: Sequence[Row], batches: bool) -> list[str]:
+    names = ["faces", *(["batch"] if batches else []), "what", "min", "median", "reference", "min", "median", "ratio"]
+    lines = _head(names, text=("what", "reference"))
+    for row in rows:
+        cells = [_count(row, "faces"), *([_count(row, "batch")] if batches else []), row["what"]]
+        if "note" in row:
+            cells += [
+                "-",
+                "-",
+                f"{row['reference']}: {row['note']}" if "reference" in row else row["note"],
+                "-",
+                "-",
+                "-",
+            ]
+        else:
+            cells += [_ms(row, "min_ms"), _ms(row, "median_ms"), row.get("reference", "-")]
+            cells += [_ms(row, "reference_min_ms"), _ms(row, "reference_median_ms")]
+            cells.append(f"{row['ratio']:.2f}" if "ratio" in row else "-")
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def _roofline(rows: Sequence[Row]) -> list[str]:
+    lines = []
+    for row in rows:
+        if row["what"].startswith("device: "):
+            lines.append(f"- {row['what'][8:]}: {row['rate'] / 1e9:,.1f} G")
+    names = ["faces", "batch", "what", "min", "median", "GFLOP", "MB", "floor", "bound by", "GFLOP/s", "achieved"]
+    lines += ["", *_head(names, text=("what", "bound by"))]
+    for row in rows:
+        if row["what"].startswith("device: "):
+            continue
+        cells = [_count(row, "faces"), _count(row, "batch"), row["what"]]
+        if "note" in row:
+            cells += ["-"] * 5 + [row["note"], "-", "-"]
+        else:
+            cells += [_ms(row, "min_ms"), _ms(row, "median_ms"), f"{row['operations'] / 1e9:.2f}"]
+            cells += [f"{row['bytes'] / 1e6:.0f}", _ms(row, "floor_ms"), row["bound"]]
+            cells += [f"{row['rate'] / 1e9:,.1f}", f"{row['achieved']:.0%}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def _profile(rows: Sequence[Row]) -> list[str]:
+    keys = ["warp_launches", "torch_operators", "refits", "host_reads", "synchronisations", "launches"]
+    keys += ["graph_launches", "copies"]
+    lines = _head(["faces", "batch", "what", *(key.replace("_", " ") for key in keys)], text=("what",))
+    for row in rows:
+        cells = [_count(row, "faces"), _count(row, "batch"), row["what"]]
+        if "note" in row:
+            cells[-1] += f": {row['note']}"
+        cells += [f"{row[key]:g}" if key in row else "-" for key in keys]
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def _head(names: Sequence[str], text: Sequence[str]) -> list[str]:
+    return [
+        "| " + " | ".join(names) + " |",
+        "| " + " | ".join("---" if name in text else "---:" for name in names) + " |",
+    ]
+
+
+def _count(row: Row, key: str) -> str:
+    return f"{row[key]:,}" if key in row else "-"
+
+
+def _ms(row: Row, key: str) -> str:
+    return f"{row[key]:,.3g}" if row.get(key, 1000.0) < 100.0 else f"{row[key]:,.0f}" if key in row else "-"
+
+
+def plot(path: Path, about: dict[str, str], rows: Sequence[Row]) -> None:
+    """Draws the parts that were run: ratios by stage, time over batch, roofline."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    timed = [row for row in rows if "note" not in row]
+    panels = [(draw, part) for draw, part in _PANELS if any(row["part"] == part for row in timed)]
+    figure, axes = pyplot.subplots(1, max(1, len(panels)), figsize=(6.2 * max(1, len(panels)), 5.0), squeeze=False)
+    for axis, (draw, part) in zip(axes[0], panels, strict=False):
+        draw(axis, [row for row in timed if row["part"] == part])
+    figure.suptitle(f"{about['device']}, torch {about['torch']}, {about['torch threads']} threads", fontsize=9)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110, format="png")
+    pyplot.close(figure)
+
+
+def _ratios(axis, rows: Sequence[Row]) -> None:
+    rows = [row for row in rows if "ratio" in row]
+    names = list(dict.fromkeys(f"{row['what'].split(',')[0]}\n{row['reference']}" for row in rows))
+    sizes = sorted({row["faces"] for row in rows})
+    for k, size in enumerate(sizes):
+        found = {
+            f"{row['what'].split(',')[0]}\n{row['reference']}": row["ratio"] for row in rows if row["faces"] == size
+        }
+        at = [i + 0.8 * (k + 0.5) / len(sizes) - 0.4 for i, name in enumerate(names) if name in found]
+        axis.plot([found[n] for n in names if n in found], at, "o", markersize=5, label=f"{size:,} faces")
+    axis.set_yticks(range(len(names)), names, fontsize=6)
+    axis.grid(axis="x", alpha=0.3)
+    axis.invert_yaxis()
+    axis.set_xscale("log")
+    axis.axvline(1.0, color="black", linewidth=0.8)
+    axis.set_xlabel("time of the reference / ours")
+    axis.set_title(TITLES["stages"], fontsize=9)
+    axis.legend(fontsize=6)
+
+
+def _batches(axis, rows: Sequence[Row]) -> None:
+    for size in sorted({row["faces"] for row in rows}):
+        mine = [row for row in rows if row["faces"] == size and row["what"] == "frame per garment"]
+        mine.sort(key=lambda row: row["batch"])
+        if mine:
+            batches = [row["batch"] for row in mine]
+            (line,) = axis.plot(batches, [row["min_ms"] for row in mine], "o-", label=f"{size:,} faces")
+            loops = [row for row in mine if "ratio" in row]
+            style = {"marker": "x", "linestyle": ":", "color": line.get_color()}
+            axis.plot([row["batch"] for row in loops], [row["reference_min_ms"] for row in loops], **style)
+    axis.set_xscale("log", base=2)
+    axis.set_yscale("log")
+    axis.axhline(1e3 / 30, color="black", linewidth=0.8)
+    axis.set_xlabel("garments in a batch (x: one by one; black line: 30 frames a second)")
+    axis.set_ylabel("ms per garment and frame")
+    axis.set_title(TITLES["batch"], fontsize=9)
+    axis.legend(fontsize=7)
+
+
+def _roofs(axis, rows: Sequence[Row]) -> None:
+    rates = {row["what"][8:].split(",")[0]: row["rate"] for row in rows if row["what"].startswith("device: ")}
+    points = [row for row in rows if "operations" in row]
+    where = [row["operations"] / row["bytes"] for row in points] or [1.0]
+    intensity = np.geomspace(min(0.5, *where) / 2, 4 * max(where), 200)
+    for name, colour in (("float32", "tab:blue"), ("bfloat16", "tab:orange")):
+        roof = np.minimum(rates[name], intensity * rates["copy"])
+        axis.plot(intensity, roof / 1e9, color=colour, label=f"{name}, measured roof")
+        mine = [row for row in points if row["what"].endswith(name)]
+        at = [row["operations"] / row["bytes"] for row in mine]
+        axis.scatter(at, [row["rate"] / 1e9 for row in mine], color=colour, s=18)
+        for x, row in zip(at, mine, strict=True):
+            place = {"xytext": (4, -8), "textcoords": "offset points", "fontsize": 5, "color": colour}
+            axis.annotate(f"{row['faces']:,} x {row['batch']}", (x, row["rate"] / 1e9), **place)
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.set_xlabel("operations per byte")
+    axis.set_ylabel("GFLOP/s")
+    axis.set_title(f"{TITLES['roofline']} (faces x batch)", fontsize=9)
+    axis.legend(fontsize=7)
+
+
+_PANELS = ((_ratios, "stages"), (_batches, "batch"), (_roofs, "roofline"))

@@ -1,0 +1,106 @@
+"""The network against the device: operations and bytes, and what the device does of either at best.
+
+Operations are those of `warpgarment.training.flops`, forward. Bytes are the fewest that the layers as written need when
+every operator reads its inputs and writes its outputs once: per token and layer, in units of the embedding E,
+
+    norms 4, q, k, v 1 + 3 - 2 m, attention 4 - 2 m, output 2, residual sums 6, feed-forward 2 + 4 W/E
+
+with m the share of manifold heads and W the feed-forward width, plus all parameters once, the geodesic weights once a
+layer, and the stacked features. The floor of a call is the larger of operations over the matrix rate and bytes over
+the copy bandwidth, both measured here in the same run; the achieved share is that floor over the measured time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+
+from warpgarment.config import NetworkConfig
+from warpgarment.kernels.features import FEATURES
+from warpgarment.simulator import Simulator
+from warpgarment.training.flops import forward_flops
+
+from .batch import scenes_of
+from .measure import NO_GPU, Row, figures, interleaved
+
+PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+MATRIX = {"cpu": 1536, "cuda": 8192}
+COPIED = {"cpu": 2**28, "cuda": 2**30}  # bytes
+TOKENS = {"cpu": 8192, "cuda": 131_072}  # faces in a batch
+
+
+def network_bytes(config: NetworkConfig, faces: int, components: int, batch: int, parameters: int, size: int) -> int:
+    """Bytes as counted above; `size` of a number."""
+    e, tokens = config.embedding, batch * (faces + components)
+    manifold = config.manifold_heads / config.heads
+    layer = 4 + (4 - 2 * manifold) + (4 - 2 * manifold) + 2 + 6 + 2 + 4 * config.feed_forward / e
+    weights = faces**2 if config.manifold_heads else 0
+    stacked = 4 * config.history * FEATURES * batch * faces
+    return int(size * (config.layers * (tokens * e * layer + weights) + parameters) + stacked)
+
+
+def device_rates(device: torch.device, seconds: float) -> dict[str, float]:
+    """Measured: operations per second of a large matrix product by precision, bytes per second of a large copy."""
+    n, rates = MATRIX[device.type], {}
+    for name, dtype in PRECISIONS.items():
+        a, b = (torch.randn(n, n, device=device).to(dtype) for _ in range(2))
+        out = torch.empty_like(a)
+        times = interleaved({name: lambda a=a, b=b, out=out: torch.mm(a, b, out=out)}, device, seconds)
+        rates[name] = 2e3 * n**3 / min(times[name])
+    source = torch.randn(COPIED[device.type] // 4, device=device)
+    target = torch.empty_like(source)
+    times = interleaved({"copy": lambda: target.copy_(source)}, device, seconds)
+    rates["copy"] = 2e3 * COPIED[device.type] / min(times["copy"])  # read and written
+    return rates
+
+
+def rows(
+    faces: Sequence[int], batches: Sequence[int], device: torch.device, weights: str, seconds: float
+) -> Iterator[Row]:
+    """The device's rates, then one row per size, batch and precision."""
+    rates = device_rates(device, seconds)
+    for name, rate in rates.items():
+        unit = "bytes" if name == "copy" else "operations"
+        yield {"part": "roofline", "what": f"device: {name}, {unit} per second", "rate": rate}
+    simulator = Simulator.from_pretrained(weights, device=device)
+    config, parameters = simulator.network.config, simulator.network.parameter_count()
+    for size in faces:
+        for number in batches:
+            if number > 1 and number * size > TOKENS[device.type]:
+                continue
+            scenes = scenes_of([size], number)
+            shapes, body_faces = [s.body.vertices[0] for s in scenes], [s.body.faces for s in scenes]
+            first = [s.first for s in scenes]
+            scene = simulator.start([s.garment for s in scenes], shapes, body_faces, first_vertices=first).scene
+            total, count = len(scene.packed.faces), len(scenes[0].garment.faces)
+            components = scene.packed.component_count // number
+            stacked = torch.randn(total, config.history, FEATURES, device=device)
+            velocities = torch.randn(scene.packed.component_count, config.history - 1, 3, device=device)
+
+            def call(half: bool, scene=scene, stacked=stacked, velocities=velocities) -> None:
+                scene.half = half
+                with torch.inference_mode():
+                    scene.predict(stacked, velocities)
+
+            calls = {"float32": lambda call=call: call(False), "bfloat16": lambda call=call: call(True)}
+            operations = number * sum(forward_flops(config, count, components))
+            for name, times in interleaved(calls, device, seconds).items():
+                moved = network_bytes(config, count, components, number, parameters, PRECISIONS[name].itemsize)
+                measured = figures(times)
+                floor = 1e3 * max(operations / rates[name], moved / rates["copy"])
+                yield {
+                    "part": "roofline",
+                    "what": f"network, {name}",
+                    "faces": count,
+                    "batch": number,
+                    **measured,
+                    "operations": operations,
+                    "bytes": moved,
+                    "floor_ms": floor,
+                    "bound": "matrix rate" if operations / rates[name] > moved / rates["copy"] else "bandwidth",
+                    "achieved": floor / measured["min_ms"],
+                    "rate": 1e3 * operations / measured["min_ms"],
+                }
+    if device.type == "cpu":
+        yield {"part": "roofline", "what": "network", "device": "cuda", "note": NO_GPU}
