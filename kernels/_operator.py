@@ -12,7 +12,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from ._torch import as_warp, torch_stream
+from ._torch import as_argument, as_warp, torch_stream
 
 Outputs = dict[str, tuple[type, tuple[int, ...]]]  # name -> (Warp element type, shape of one row)
 
@@ -36,8 +36,8 @@ def launch(
         wp.launch(
             kernel,
             dim=rows,
-            inputs=[as_warp(tensor, dtype) for tensor, dtype in inputs],
-            outputs=[as_warp(tensor, dtype) for tensor, dtype in outputs],
+            inputs=[as_argument(tensor, dtype) for tensor, dtype in inputs],
+            outputs=[as_argument(tensor, dtype) for tensor, dtype in outputs],
             device=warp_device,
         )
 

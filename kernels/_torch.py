@@ -53,6 +53,16 @@ def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
 
+def as_argument(tensor: torch.Tensor, dtype: type) -> object:
+    """What `as_warp` says, for the arguments of a launch alone, at half the cost: a descriptor.
+
+    It keeps no memory alive, so the tensor must outlive the launch; a copy that had to be made is kept by its array.
+    """
+    if tensor.numel() == 0 or not tensor.is_contiguous():
+        return as_warp(tensor, dtype)
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
 @contextlib.contextmanager
 def torch_stream(device: torch.device) -> Iterator[wp.Device]:
     """Launches inside run on torch's current stream of the device. Yields the Warp device.

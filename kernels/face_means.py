@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from ._operator import allocate
-from ._torch import as_warp, expect, torch_stream
+from ._torch import as_argument, as_warp, expect, torch_stream
 
 LANES = 256
 """Threads that share a segment on a GPU."""
@@ -65,26 +65,22 @@ class FaceMeans:
                 raise ValueError(f"{name} must lie within [0, {limit}), got {int(values.min())} to {int(values.max())}")
         order = torch.argsort(segment, stable=True)
         ends = torch.bincount(segment.long(), minlength=count).cumsum(0)
-        self._faces = faces[order].contiguous()
-        self._offsets = torch.cat([ends.new_zeros(1), ends]).int()
+        self.device = faces.device
+        self._faces = as_warp(faces[order], wp.vec3i)
+        self._offsets = as_warp(torch.cat([ends.new_zeros(1), ends]).int(), wp.int32)
         self.count, self.vertex_count = count, vertex_count
 
     def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
         """Positions [m], float32 [V, 3], to means [m], float32 [count, 3]; zero for a segment without faces."""
-        device = self._faces.device
-        expect("vertices", vertices, (self.vertex_count, 3), device=device)
-        means = allocate((self.count, 3), torch.float32, device)
+        expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
+        means = allocate((self.count, 3), torch.float32, self.device)
         if self.count:
-            with torch_stream(device) as warp_device:
+            with torch_stream(self.device) as warp_device:
                 wp.launch_tiled(
                     face_means_kernel,
                     dim=[self.count],
-                    inputs=[
-                        as_warp(self._faces, wp.vec3i),
-                        as_warp(self._offsets, wp.int32),
-                        as_warp(vertices, wp.vec3),
-                    ],
-                    outputs=[as_warp(means, wp.vec3)],
+                    inputs=[self._faces, self._offsets, as_argument(vertices, wp.vec3)],
+                    outputs=[as_argument(means, wp.vec3)],
                     block_dim=LANES,
                     device=warp_device,
                 )

@@ -4,7 +4,7 @@ Manifold-aware transformers, section 4.2 (the sign of d_i); generalised winding 
 angles after van Oosterom and Strackee 1983.
 
 The winding number of a closed surface is an integer: the signed number of times that any ray from the point crosses it,
-+1 where the ray leaves and -1 where it enters. Limbs may overlap, and a ray costs a fifth of summing solid angles over
++1 where the ray leaves and -1 where it enters. Limbs may overlap, and a ray costs a tenth of summing solid angles over
 a tree of faces. A body with holes is closed by caps C, and what they add is taken away again:
 
     w(M) = crossings(M + C) - w(C),    w(C) = sum of Ω / 4π,    tan(Ω/2) = det(a,b,c) / (|a||b||c| + (a·b)|c| + ...)

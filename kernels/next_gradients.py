@@ -19,7 +19,7 @@ import torch
 import warp as wp
 
 from ._operator import allocate
-from ._torch import as_warp, expect, torch_stream
+from ._torch import as_argument, expect, torch_stream
 from .singular_values import svd
 
 
@@ -112,21 +112,21 @@ def next_gradients(
     target = allocate((rows, 3, 3), torch.float32, device)
     if rows:
         with torch_stream(device) as warp_device:
-            gradients, values = as_warp(psi, wp.mat33), as_warp(singular_values, wp.vec3)
-            owner, marked = as_warp(garment_of_face, wp.int32), as_warp(broken, wp.int32)
-            components = as_warp(component_of_face, wp.int32)
+            gradients, values = as_argument(psi, wp.mat33), as_argument(singular_values, wp.vec3)
+            owner, marked = as_argument(garment_of_face, wp.int32), as_argument(broken, wp.int32)
+            components = as_argument(component_of_face, wp.int32)
             wp.launch(
                 broken_garments_kernel,
                 dim=rows,
-                inputs=[owner, components, gradients, values, as_warp(velocity, wp.vec3)],
+                inputs=[owner, components, gradients, values, as_argument(velocity, wp.vec3)],
                 outputs=[marked],
                 device=warp_device,
             )
             wp.launch(
                 next_gradients_kernel,
                 dim=rows,
-                inputs=[owner, replace, smallest, as_warp(features, wp.float32), gradients, values, marked],
-                outputs=[as_warp(target, wp.mat33)],
+                inputs=[owner, replace, smallest, as_argument(features, wp.float32), gradients, values, marked],
+                outputs=[as_argument(target, wp.mat33)],
                 device=warp_device,
             )
     return target, broken == 0

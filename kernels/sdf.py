@@ -27,7 +27,8 @@ import warp as wp
 
 from ._operator import allocate, launch
 from ._torch import expect, torch_stream
-from .body_meshes import BodyMeshes, BodyQuery, query_bodies
+from .body_meshes import BodyMeshes, BodyQuery
+from .closest import query_bodies
 
 __all__ = ["BodyMeshes", "BodyQuery", "signed_distance"]
 

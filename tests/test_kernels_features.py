@@ -11,6 +11,7 @@ from reference import signed_distance as reference_distance
 from reference.finite_differences import numeric_gradient
 
 from warpgarment.kernels import deformation, features, sdf
+from warpgarment.kernels.frame_features import frame_features
 
 GARMENTS = meshes.garments()
 
@@ -116,9 +117,9 @@ def test_one_launch_is_the_same_as_two(name, poisoned):
     two = scene.features(scene.vertices, scene.garment_mean, scene.interaction())
     poisoned.clear()
     arguments = (scene.inverse_rest, scene.vertices, scene.faces, scene.garment_of_face, scene.garment_mean)
-    one = features.frame_features(*arguments, None, scene.bodies, after)
+    one = frame_features(*arguments, None, scene.bodies, after)
     assert len(poisoned) == 1
-    again = features.frame_features(*arguments, None, scene.bodies, after)
+    again = frame_features(*arguments, None, scene.bodies, after)
     assert torch.equal(one.view(torch.int32), again.view(torch.int32))
     np.testing.assert_array_equal(one.numpy(), two.numpy())
     assert torch.isfinite(one).all(1).any() or name == "tetrahedron"
@@ -141,9 +142,9 @@ def test_one_launch_refuses_what_two_refuse():
     ]
     for position, value, error, word in wrong:
         with pytest.raises(error, match=word):
-            features.frame_features(*arguments[:position], value, *arguments[position + 1 :])
+            frame_features(*arguments[:position], value, *arguments[position + 1 :])
     empty = [scene.inverse_rest[:0], scene.vertices, scene.faces[:0], nothing[:0], scene.garment_mean, nothing[:0]]
-    assert features.frame_features(*empty, scene.bodies, after).shape == (0, features.FEATURES)
+    assert frame_features(*empty, scene.bodies, after).shape == (0, features.FEATURES)
 
 
 @pytest.mark.parametrize("name", GARMENTS)

@@ -20,7 +20,7 @@ from warpgarment.garment import Garment
 from warpgarment.kernels.collision import CollisionSolver
 from warpgarment.kernels.deformation import inverse_rest_frames
 from warpgarment.kernels.face_means import FaceMeans
-from warpgarment.kernels.features import frame_features
+from warpgarment.kernels.frame_features import frame_features
 from warpgarment.kernels.next_gradients import next_gradients
 from warpgarment.kernels.poisson import PoissonSolver
 from warpgarment.kernels.sdf import BodyMeshes
