@@ -4,7 +4,7 @@
 
 P and D_c are those of `pooled_geodesics.py`; a subset of faces takes its rows of P, and the sums s of its own. P has a
 few entries in each row: its products are PyTorch's weighted sums of bags of rows, which took a hundredth of the time of
-a Warp kernel with a thread per entry, and a seventh of that of torch.sparse, on one CPU core.
+a Warp kernel with a thread per entry, and a sixth of that of torch.sparse, at 50,000 faces on one CPU core.
 """
 
 from __future__ import annotations
@@ -135,9 +135,14 @@ def dense_weights(
     garment: PooledGeodesics, subset: np.ndarray, radius: float, power: float, device: torch.device
 ) -> torch.Tensor:
     """The same for one subset of n faces as a matrix, float32 [n,n]; small next to F x F where n is."""
-    each = pooled_weights([(garment, np.asarray(subset))], radius, power, device)
-    columns = torch.eye(len(subset), device=device)
-    return each.spread(columns[None])[0]
+    count, kernel = len(subset), _kernel(garment, radius, power, device)
+    start = np.arange(count + 1) * garment.nearest.shape[1]
+    shape = (count, len(kernel))
+    matrix = csr_matrix((garment.weight[subset].ravel(), garment.nearest[subset].ravel(), start), shape=shape)
+    bags, none = Bags.of(matrix, device), Bags(*torch.empty(3, 0, device=device))
+    half = bag_product(kernel, bags, none)  # P K, and K is symmetric
+    product = bag_product(half.T.contiguous(), bags, none)
+    return product / product.sum(dim=1, keepdim=True)
 
 
 def _kernel(garment: PooledGeodesics, radius: float, power: float, device: torch.device) -> torch.Tensor:
