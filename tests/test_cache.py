@@ -4,8 +4,8 @@ import threading
 
 import numpy as np
 import pytest
+from test_geodesics import skirt
 
-from tests.test_geodesics import skirt
 from warpgarment import cache
 from warpgarment.garment import Garment
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse import random as random_matrix
+from test_geodesics import MESHES, exact_distances, flat, skirt
 
-from tests.test_geodesics import MESHES, exact_distances, flat, skirt
 from warpgarment.attention import ManifoldAwareAttention
 from warpgarment.batch import PackedGarments, padded_views
 from warpgarment.garment import Garment
