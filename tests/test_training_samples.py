@@ -296,3 +296,24 @@ def test_losses_of_parts_average_to_the_loss_of_the_batch():
         halves.append(loss(x, y, network, LossConfig(), None if width == 1 else mask[part], torch.tensor(7 / 2)))
     for k in range(4):
         torch.testing.assert_close((halves[0][k] + halves[1][k]) / 2, whole[k], atol=0, rtol=1e-6)
+
+
+def test_large_garments_train_without_all_pairs(data, tmp_path, monkeypatch):
+    """A large garment would fill memory and disk with F x F distances, or train with other weights than it moves with.
+
+    Against P exp(-(D_c s/r)^p) P^T in float64, for a garment made s times as large; 1e-5: float32.
+    """
+    monkeypatch.setattr("warpgarment.garment.POOLED", 10)
+    folder = data / "train_0"
+    sequence = SequenceData(Sequence.load(folder), folder, tmp_path, SMALL, torch.device("cpu"))
+    assert not list(tmp_path.rglob("geodesics.npy"))
+    found = SampleBuilder([sequence], SMALL, QUIET, PLAIN).build([(0, 3)], 30, np.random.default_rng(0)).weights
+    assert found.shape == (1, 30, 30)
+    subset = np.arange(0, len(sequence.faces), 3)
+    pooled = sequence.source.garment.pooled_geodesics
+    p = np.zeros((len(subset), len(pooled.distances)))
+    np.add.at(p, (np.arange(len(subset))[:, None], pooled.nearest[subset]), pooled.weight[subset].astype(np.float64))
+    expected = p @ np.exp(-((pooled.distances.astype(np.float64) * 1.1 / 0.2) ** 2)) @ p.T
+    expected /= expected.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(sequence.weights(subset, 1.1).numpy(), expected, atol=1e-5)
+    assert "geodesics" not in vars(sequence.source.garment)

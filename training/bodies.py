@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgarment.cache import cache_folder
 from warpgarment.errors import MissingExtra
 
 from .mesh_cutting import averaging, boundary_loops, compacted, without_short_edges
@@ -182,14 +183,6 @@ def _evaluate(model, phenotype: dict[str, float]) -> tuple[np.ndarray, np.ndarra
     vertices = out["rest_vertices"][0].double().numpy() @ _Y_UP.T
     joints = out["rest_bone_poses"][0, :, :3, 3].double().numpy() @ _Y_UP.T
     return vertices, joints
-
-
-def cache_folder() -> Path:
-    """Where derived files are kept: $WARPGARMENT_CACHE, or the user's cache folder."""
-    named = os.environ.get("WARPGARMENT_CACHE")
-    if named:
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "warpgarment"
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,7 @@ far the dearest part of a training sample, are done once for every frame t in 0.
 array
 
     interaction.npy   float32 [T-1, F, 16]   columns: see COLUMNS; row t holds the body's motion from frame t to t + 1
-    geodesics.npy     float32 [F, F]         metres, inf across components
+    geodesics.npy     float32 [F, F]         metres, inf across components; garments beyond 10,000 faces have none
 
 in a folder named after the sequence and the checksum of everything that went in (array files, versions). A folder is
 written under another name and renamed when complete, so that what exists is whole.
@@ -116,7 +116,9 @@ def unpack(rows: torch.Tensor) -> BodyInteraction:
     )
 
 
-def cached(sequence, folder: Path, cache: Path, device: torch.device | str = "cpu") -> tuple[np.ndarray, np.ndarray]:
+def cached(
+    sequence, folder: Path, cache: Path, device: torch.device | str = "cpu"
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Loads a sequence's interactions and geodesics from the cache, computing and storing them first where need be.
 
     Args:
@@ -126,7 +128,7 @@ def cached(sequence, folder: Path, cache: Path, device: torch.device | str = "cp
         device: Where missing values are computed.
 
     Returns:
-        Memory maps: interaction float32 [T-1, F, 16] and geodesics float32 [F, F].
+        Memory maps: interaction float32 [T-1, F, 16] and geodesics float32 [F, F]; None for garments that pool theirs.
 
     Raises:
         UnusableSequence: The values are not finite.
@@ -141,7 +143,8 @@ def cached(sequence, folder: Path, cache: Path, device: torch.device | str = "cp
         temporary = Path(tempfile.mkdtemp(prefix=".writing-", dir=cache))
         try:
             np.save(temporary / "interaction.npy", interaction)
-            np.save(temporary / "geodesics.npy", np.asarray(sequence.garment.geodesics, np.float32))
+            if not sequence.garment.pools:
+                np.save(temporary / "geodesics.npy", np.asarray(sequence.garment.geodesics, np.float32))
             manifest = {"cache_version": CACHE_VERSION, "device": str(device)}
             (temporary / "manifest.json").write_text(json.dumps(manifest))
             try:
@@ -152,7 +155,10 @@ def cached(sequence, folder: Path, cache: Path, device: torch.device | str = "cp
                     os.replace(temporary, place)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
-    return np.load(place / "interaction.npy", mmap_mode="r"), np.load(place / "geodesics.npy", mmap_mode="r")
+    interaction = np.load(place / "interaction.npy", mmap_mode="r")
+    if sequence.garment.pools:
+        return interaction, None
+    return interaction, np.load(place / "geodesics.npy", mmap_mode="r")
 
 
 def main(arguments: list[str]) -> None:

@@ -122,6 +122,7 @@ class SampleBuilder:
         for b, (s, t) in enumerate(picks):
             sequence, rng = self.sequences[s], streams[b]
             subset = np.sort(rng.permutation(len(sequence.faces))[:faces])
+            weights[b] = sequence.weights(subset, scale[b])
             subset = self._send(subset)
             frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
             past = sequence.vertices[frames]
@@ -143,10 +144,6 @@ class SampleBuilder:
                 rows[b, :, :early, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
                 rows[b, :, :early, COLUMNS["velocity"]] = 0.0
             inverse_rest[b] = sequence.inverse_rest[subset]
-            kernel = sequence.kernel[subset[:, None], subset[None, :]].float()
-            if scale[b] != 1.0:  # exp(-(s D/r)^p) = exp(-(D/r)^p)^(s^p)
-                kernel = kernel ** float(scale[b] ** self.network.geodesic_power)
-            torch.div(kernel, kernel.sum(dim=1, keepdim=True), out=weights[b])
             chosen, vertices = sequence.faces[subset], past.shape[1]
             steps = torch.arange(history, dtype=torch.int32, device=device) * vertices + start
             corners.append(chosen[:, None, :] + steps[None, :, None])

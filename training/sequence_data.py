@@ -13,6 +13,7 @@ from warpgarment.garment import Garment
 from warpgarment.heading import yaw
 from warpgarment.kernels.deformation import deformation_gradient_from_inverse, inverse_rest_frames
 from warpgarment.kernels.laplacian import components
+from warpgarment.pooled_weights import dense_weights
 from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached
 from warpgarment.training.noise import NoiseBasis
 
@@ -96,6 +97,17 @@ class SequenceData:
             phi = deformation_gradient_from_inverse(self.inverse_rest, vertices.contiguous(), self.faces)
             angles.append(yaw(phi[None]))
         return torch.cat(angles)
+
+    def weights(self, subset: np.ndarray, scale: float = 1.0) -> torch.Tensor:
+        """Geodesic weights of some faces [n] of the garment, `scale` times as large; float32 [n,n]."""
+        power, radius = self._network.geodesic_power, self._network.geodesic_radius
+        if self._geodesics is None:
+            return dense_weights(self.source.garment.pooled_geodesics, subset, radius / scale, power, self.device)
+        chosen = torch.from_numpy(subset).to(self.device)
+        kernel = self.kernel[chosen[:, None], chosen[None, :]].float()
+        if scale != 1.0:  # exp(-(s D/r)^p) = exp(-(D/r)^p)^(s^p)
+            kernel = kernel ** float(scale**power)
+        return kernel / kernel.sum(dim=1, keepdim=True)
 
     @property
     def kernel(self) -> torch.Tensor:

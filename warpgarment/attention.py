@@ -18,6 +18,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from warpgarment.pooled_weights import PooledWeights
+
 ACTIVATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"relu": F.relu, "gelu": F.gelu}
 
 
@@ -62,12 +64,14 @@ class ManifoldAwareAttention(nn.Module):
         nn.init.zeros_(self.qkv.bias)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, x: torch.Tensor, weights: torch.Tensor, key_mask: torch.Tensor | None) -> torch.Tensor:
+    def forward(
+        self, x: torch.Tensor, weights: torch.Tensor | PooledWeights, key_mask: torch.Tensor | None
+    ) -> torch.Tensor:
         """Attends.
 
         Args:
             x: Tokens, shape [B,T,E], faces first.
-            weights: Geodesic weights, shape [B,N,N], or [1,N,N] where all the batch shares one garment.
+            weights: Geodesic weights, shape [B,N,N], or [1,N,N] where all the batch shares one garment; or pooled.
             key_mask: True where a token is real, shape [B,1,1,T]; None where all are.
 
         Returns:
@@ -94,11 +98,14 @@ class ManifoldAwareAttention(nn.Module):
         return self.out(outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=-1))
 
 
-def _spread(weights: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+def _spread(weights: torch.Tensor | PooledWeights, value: torch.Tensor) -> torch.Tensor:
     """Weights times the values of the faces, the values of velocity tokens as they are; [B,N,N], [B,T,K] -> [B,T,K].
 
     All manifold heads share their weights, so they are one product; and so is a batch that shares one garment.
     """
+    if isinstance(weights, PooledWeights):
+        faces = weights.scale.shape[1]
+        return torch.cat([weights.spread(value[:, :faces]), value[:, faces:]], dim=1)
     faces = weights.shape[-1]
     face_value, velocity_value = value[:, :faces], value[:, faces:]
     if weights.shape[0] == 1 and value.shape[0] > 1:
@@ -144,7 +151,9 @@ class EncoderLayer(nn.Module):
         self.norm_first = norm_first
         self.activation = ACTIVATIONS[activation]
 
-    def forward(self, x: torch.Tensor, weights: torch.Tensor, key_mask: torch.Tensor | None) -> torch.Tensor:
+    def forward(
+        self, x: torch.Tensor, weights: torch.Tensor | PooledWeights, key_mask: torch.Tensor | None
+    ) -> torch.Tensor:
         """Tokens [B,T,E] -> tokens [B,T,E]; the other arguments as in `ManifoldAwareAttention.forward`."""
         if self.norm_first:
             x = x + self.dropout(self.attention(self.attention_norm(x), weights, key_mask))

@@ -17,6 +17,8 @@ from warpgarment.garment import Garment
 from warpgarment.kernels.laplacian import components
 from warpgarment.network import NetworkConfig, geodesic_weights
 from warpgarment.parametrisation import NetworkOutput
+from warpgarment.pooled_geodesics import CENTRES
+from warpgarment.pooled_weights import PooledWeights, pooled_weights
 
 TOKENS_PER_VIEW = 131_072  # faces in one call of the network: bounds its activations to a few GB
 WEIGHTS_PER_VIEW = 2**30  # entries of geodesic weights in one call: 4 GB
@@ -130,7 +132,7 @@ class PaddedView:
     face_mask: torch.Tensor | None  # bool [R,N]; None where nothing is padded
     component_index: torch.Tensor  # int64 [R,C], into the packed components; 0 where padded
     component_mask: torch.Tensor | None  # bool [R,C]
-    weights: torch.Tensor  # geodesic weights, [R,N,N] or [1,N,N]
+    weights: torch.Tensor | PooledWeights  # geodesic weights, [R,N,N] or [1,N,N]; pooled for large garments
     share: torch.Tensor  # [R], one over the number of rows of the same garment
     real_faces: torch.Tensor | None  # int64, where face_mask is True in rows end to end; None where all are
     real_components: torch.Tensor | None  # the same of component_mask
@@ -190,8 +192,10 @@ def row_groups(face_counts: Sequence[int], face_splits: int) -> list[list[tuple[
     for row in rows:
         if groups:
             longest, together = groups[-1][0][2], len(groups[-1]) + 1
-            fits = together * longest <= TOKENS_PER_VIEW and together * longest**2 <= WEIGHTS_PER_VIEW
-            if fits and longest <= PADDING * row[2]:
+            pooled = garments[row[0]].pools
+            entries = CENTRES**2 if pooled else longest**2
+            fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
+            if fits and pooled == garments[groups[-1][0][0]].pools and longest <= PADDING * row[2]:
                 groups[-1].append(row)
                 continue
         groups.append([row])
@@ -206,6 +210,7 @@ def _view(
     rows: Sequence[tuple[int, int, int]],
 ) -> PaddedView:
     device = packed.faces.device
+    weights: torch.Tensor | PooledWeights
     faces = max(row[2] for row in rows)
     width = max(packed.component_offsets[g + 1] - packed.component_offsets[g] for g, _, _ in rows)
     face_index = np.full((len(rows), faces), -1)
@@ -217,6 +222,17 @@ def _view(
 
     if not config.manifold_heads:
         weights = torch.zeros((1, 0, 0), device=device)
+    elif garments[rows[0][0]].pools:
+        same = len({(id(garments[g]), first) for g, first, _ in rows}) == 1
+        weights = pooled_weights(
+            [
+                (garments[g].pooled_geodesics, np.arange(first, len(garments[g].faces), face_splits))
+                for g, first, _ in (rows[:1] if same else rows)
+            ],
+            config.geodesic_radius,
+            config.geodesic_power,
+            device,
+        )
     elif len({(id(garments[g]), first) for g, first, _ in rows}) == 1:
         weights = _weights(garments[rows[0][0]], rows[0][1], face_splits, config, device)[None]
     else:

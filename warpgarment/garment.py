@@ -5,14 +5,22 @@ from __future__ import annotations
 import os
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from .cache import remembered
 from .errors import MeshError
 from .mesh_checks import REMEDY, check_rest_mesh, checked_faces, checked_pins, checked_positions, directed_edges
 from .mesh_clean import clean_mesh
+
+if TYPE_CHECKING:
+    from .pooled_geodesics import PooledGeodesics
+
+
+POOLED = 10_000  # faces beyond which the network's weights are pooled: F x F of them would take 400 MB
+KEPT = 1_000  # faces from which distances are kept on disk; with less they are quickly found
 
 
 class Garment:
@@ -24,8 +32,8 @@ class Garment:
         pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty where there are none.
         name: For messages and file names.
 
-    What is cached (`edges`, `components`, `face_frames`, `geodesics`, `laplacian`) belongs to these arrays: make a new
-    garment instead of changing them.
+    What is cached (`edges`, `components`, `face_frames`, `geodesics`, `pooled_geodesics`, `laplacian`) belongs to
+    these arrays: make a new garment instead of changing them.
 
     Args:
         vertices: Rest positions [m], shape [V,3]; NumPy, torch or nested lists.
@@ -139,10 +147,45 @@ class Garment:
 
     @cached_property
     def geodesics(self) -> np.ndarray:
-        """Distances over the surface between face centroids [m], float32, shape [F,F]; see `face_geodesics`."""
-        from .geodesics import face_geodesics
+        """Distances over the surface between face centroids [m], float32, shape [F,F]; see `face_geodesics`.
 
-        return face_geodesics(self.vertices, self.faces)
+        From 1,000 faces they are kept on disk, see `cache.remembered`.
+        """
+        from .geodesics import VERSION, face_geodesics
+
+        count = len(self.faces)
+        if count < KEPT:
+            return face_geodesics(self.vertices, self.faces)
+        return remembered(
+            f"geodesics-{VERSION}",
+            [self.vertices, self.faces],
+            {"distances": ("float32", (count, count))},
+            lambda: {"distances": face_geodesics(self.vertices, self.faces)},
+        )["distances"]
+
+    @property
+    def pools(self) -> bool:
+        """Whether the network's geodesic weights are pooled: beyond 10,000 faces."""
+        return len(self.faces) > POOLED
+
+    @cached_property
+    def pooled_geodesics(self) -> PooledGeodesics:
+        """Distances between some thousand centres, and from them to all faces; kept on disk like `geodesics`."""
+        from .pooled_geodesics import CENTRES, NEAR, VERSION, PooledGeodesics, pooled_geodesics
+
+        count = len(self.faces)
+        expected = {
+            "distances": ("float32", (None, None)),
+            "nearest": ("int32", (count, NEAR)),
+            "weight": ("float32", (count, NEAR)),
+        }
+        found = remembered(
+            f"pooled-{VERSION}",
+            [self.vertices, self.faces, CENTRES],
+            expected,
+            lambda: pooled_geodesics(self.vertices, self.faces)._asdict(),
+        )
+        return PooledGeodesics(**found)
 
     @cached_property
     def laplacian(self) -> csr_matrix:

@@ -32,6 +32,7 @@ LEAST_DEPTH = 4  # but not before they have crossed this many faces,
 DEPTH = 400  # and in any case after this many
 SADDLE = 1e-3  # angle beyond 2 pi from which a vertex can bend a shortest path [rad]
 BLOCK = 512  # sources of one search of local distances
+VERSION = 1  # raise it whenever the result changes: it is part of the name under which results are kept
 MEMORY_BUDGET = 8 * 2**30  # bytes of float32 distances that are still computed: about 46,000 faces
 
 
@@ -50,7 +51,7 @@ def face_geodesics(rest_vertices: Any, faces: Any) -> np.ndarray:
         MeshError: Bad shapes or indices, positions that are not finite, non-manifold edges, faces without area, or a
             matrix beyond `MEMORY_BUDGET`.
     """
-    vertices, faces = _checked(rest_vertices, faces)
+    vertices, faces = checked_mesh(rest_vertices, faces)
     need = 4 * len(faces) ** 2
     if need > MEMORY_BUDGET:
         raise MeshError(
@@ -87,20 +88,12 @@ def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix
     """
     if not radius > 0.0:
         raise ValueError(f"radius must be positive, got {radius}")
-    vertices, faces = _checked(rest_vertices, faces)
-    mesh = _Unfolding(vertices.astype(np.float64), faces.astype(np.int64))
-    graph, count = _segments(mesh), len(faces)
-    nodes = np.concatenate([vertices[faces].mean(axis=1), vertices[mesh.node_of_vertex >= 0]]).astype(np.float64)
+    vertices, faces = checked_mesh(rest_vertices, faces)
+    count = len(faces)
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     stored = 0
-    for block in _neighbourhoods(nodes[:count]):
-        low, high = nodes[block].min(axis=0) - 1.001 * radius, nodes[block].max(axis=0) + 1.001 * radius
-        inside = np.nonzero(((nodes >= low) & (nodes <= high)).all(axis=1))[0]
-        part = dijkstra(
-            graph[inside][:, inside], indices=np.searchsorted(inside, block), limit=radius * (1 + 1e-6)
-        )  # rounded to float32 before they are compared, so that ties end as they do in the dense matrix
-        part = part[:, : np.searchsorted(inside, count)].astype(np.float32)
-        row, column = np.nonzero((part <= radius) & (part < np.inf) & (block[:, None] < inside[: part.shape[1]]))
+    for block, inside, part in searches(vertices, faces, np.arange(count), radius):
+        row, column = np.nonzero((part <= radius) & (part < np.inf) & (block[:, None] < inside))
         found.append((block[row], inside[column], part[row, column]))
         stored += 2 * len(row)
         if 8 * stored > MEMORY_BUDGET:
@@ -112,6 +105,36 @@ def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix
     upper_half = csr_matrix((length, (source, target)), shape=(count, count))
     diagonal = csr_matrix((np.zeros(count, np.float32), np.arange(count), np.arange(count + 1)), shape=(count, count))
     return _stacked(upper_half, diagonal)
+
+
+def searches(
+    vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray, radius: float
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Searches from some faces for all within a radius, block by block of neighbours.
+
+    Args:
+        vertices: Positions [m], shape [V,3].
+        faces: Vertex indices, shape [F,3].
+        sources: Faces to start from, shape [S].
+        radius: How far to look [m].
+
+    Yields:
+        Sources of a block, shape [s]; the faces in its box, ascending, shape [n]; and distances [m], float32, shape
+        [s,n], `inf` (or just above the radius) for what is further away.
+    """
+    mesh = _Unfolding(vertices.astype(np.float64), faces.astype(np.int64))
+    graph, count = _segments(mesh), len(faces)
+    nodes = np.concatenate([vertices[faces].mean(axis=1), vertices[mesh.node_of_vertex >= 0]]).astype(np.float64)
+    del mesh
+    for chosen in _neighbourhoods(nodes[sources]):
+        block = sources[chosen]
+        low, high = nodes[block].min(axis=0) - 1.001 * radius, nodes[block].max(axis=0) + 1.001 * radius
+        inside = np.nonzero(((nodes >= low) & (nodes <= high)).all(axis=1))[0]
+        of_faces = np.searchsorted(inside, count)
+        part = dijkstra(
+            graph[inside][:, inside], indices=np.searchsorted(inside, block), limit=radius * (1 + 1e-6)
+        )  # rounded to float32 before they are compared, so that ties end as they do in the dense matrix
+        yield block, inside[:of_faces], part[:, :of_faces].astype(np.float32)
 
 
 def _stacked(upper: csr_matrix, diagonal: csr_matrix) -> csr_matrix:
@@ -139,7 +162,8 @@ def _neighbourhoods(points: np.ndarray) -> Iterator[np.ndarray]:
         waiting += [order[len(order) // 2 :], order[: len(order) // 2]]
 
 
-def _checked(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+def checked_mesh(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Float32 vertices and int32 faces of a mesh that paths can be found on; raises MeshError."""
     vertices = checked_positions(rest_vertices, name="rest_vertices")
     faces = checked_faces(faces, len(vertices))
     complain(repeated_vertices(faces) | no_area(vertices, faces), "faces", "have no area", "Run garment.cleaned().")
@@ -173,10 +197,14 @@ def surface_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
 def _segments(mesh: _Unfolding) -> csr_matrix:
     seen = [mesh.spread(mesh.from_centroids()), mesh.spread(mesh.from_vertices()), mesh.over_midpoints()]
     source, target, length = (np.concatenate(parts) for parts in zip(*seen, strict=True))
-    rows, cols = np.concatenate([source, target]), np.concatenate([target, source])
+    del seen
+    rows = np.concatenate([source, target]).astype(np.int32, copy=False)
+    cols = np.concatenate([target, source]).astype(np.int32, copy=False)
+    del source, target
     length = np.concatenate([length, length])
     order = np.lexsort((length, cols, rows))
     rows, cols, length = rows[order], cols[order], length[order]
+    del order
     keep = np.ones(len(rows), dtype=bool)
     keep[1:] = (rows[1:] != rows[:-1]) | (cols[1:] != cols[:-1])
     keep &= rows != cols
@@ -291,7 +319,7 @@ class _Unfolding:
                 slack = -1e-9 * size
                 visible = (_cross(ray_right, point) >= slack * np.linalg.norm(ray_right, axis=1)) & (node >= 0)
                 visible &= _cross(point, ray_left) >= slack * np.linalg.norm(ray_left, axis=1)
-                found.append((source[visible], node[visible], size[visible]))
+                found.append((source[visible].astype(np.int32), node[visible].astype(np.int32), size[visible]))
             beside_right, beside_left = _cross(ray_right, apex), _cross(apex, ray_left)
             tiny = 1e-12 * np.linalg.norm(apex, axis=1)
             a = beside_right > tiny * np.linalg.norm(ray_right, axis=1)  # part of the window passes right of the apex

@@ -30,6 +30,7 @@ from warpgarment.attention import EncoderLayer, geodesic_weights
 from warpgarment.config import NetworkConfig
 from warpgarment.kernels.features import FEATURES
 from warpgarment.parametrisation import NetworkOutput
+from warpgarment.pooled_weights import PooledWeights
 
 __all__ = [
     "STATISTICS",
@@ -136,7 +137,7 @@ class ManifoldAwareTransformer(nn.Module):
         self,
         face_features: torch.Tensor,
         velocities: torch.Tensor,
-        geodesic_weights: torch.Tensor,
+        geodesic_weights: torch.Tensor | PooledWeights,
         *,
         face_mask: torch.Tensor | None = None,
         velocity_mask: torch.Tensor | None = None,
@@ -147,7 +148,7 @@ class ManifoldAwareTransformer(nn.Module):
             face_features: Stacked features, oldest first, shape [B,N,H*34].
             velocities: Past velocities of each component [m/frame], oldest first, shape [B,C,(H-1)*3].
             geodesic_weights: From the function of that name, shape [B,N,N], or [1,N,N] for a batch of one garment
-                many times; zero in padded columns.
+                many times; zero in padded columns. Large garments have `PooledWeights`.
             face_mask: True where a face is real, shape [B,N]; None where all are.
             velocity_mask: True where a component is real, shape [B,C]; None where all are.
 
@@ -190,7 +191,7 @@ class ManifoldAwareTransformer(nn.Module):
         self,
         x: torch.Tensor,
         v: torch.Tensor,
-        geodesic_weights: torch.Tensor,
+        geodesic_weights: torch.Tensor | PooledWeights,
         *,
         face_mask: torch.Tensor | None = None,
         velocity_mask: torch.Tensor | None = None,

@@ -16,7 +16,8 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
-from ..bodies import cache_folder
+from warpgarment.cache import cache_folder
+
 from . import TeacherError
 
 PYTHON_VERSION = "3.11"
