@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from warpgarment import checkpoint
 from warpgarment.metrics import mean_vertex_error
+from warpgarment.patches import PatchLayout
 from warpgarment.training import state as training_state
 from warpgarment.training.distributed import Group
 from warpgarment.training.flops import step_flops
@@ -179,7 +180,9 @@ class Run:
         self.average.update(network)
         self.unread.append(torch.cat([losses, norm.detach()[None]]))
         samples, faces = batch.features.shape[:2]
-        self.rate.count(samples, step_flops(network.config, samples, faces, batch.velocities.shape[1]))
+        components = batch.velocities.shape[1]
+        patches = batch.weights.start.shape[1] if isinstance(batch.weights, PatchLayout) else 0
+        self.rate.count(samples, step_flops(network.config, samples, faces, components, patches))
 
     def read_losses(self) -> None:
         """Fetches the figures of the steps since the last time; stops the run where one is not finite."""
@@ -284,8 +287,8 @@ class Run:
         path = self.out / f"not_finite_{step}.npz"
         if self.group.first:
             batch = self.loader.build(step, part=slice(None))
-            arrays = {"features": batch.features, "velocities": batch.velocities, "weights": batch.weights}
-            arrays |= batch.target._asdict()
+            arrays = {"features": batch.features, "velocities": batch.velocities} | batch.target._asdict()
+            arrays["weights"] = batch.weights.weights if isinstance(batch.weights, PatchLayout) else batch.weights
             names = np.array([name for name, _ in batch.ids])
             frames = np.array([frame for _, frame in batch.ids])
             np.savez(path, sequence=names, frame=frames, **{k: v.cpu().numpy() for k, v in arrays.items()})

@@ -12,6 +12,7 @@ from warpgarment.body import BodyMotion
 from warpgarment.heading import yaw
 from warpgarment.kernels.deformation import deformation_gradient_from_inverse, inverse_rest_frames
 from warpgarment.kernels.laplacian import components
+from warpgarment.patches import Patches, patches
 from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached
 from warpgarment.training.noise import NoiseBasis
 
@@ -64,6 +65,12 @@ class SequenceData:
     def body(self) -> BodyMotion:
         """The collider, for rollouts."""
         return self.source.body()
+
+    @cached_property
+    def patches(self) -> Patches:
+        """The garment's patches, for a network that has them."""
+        garment, distances = self.source.garment, self._geodesics
+        return patches(garment.vertices, garment.faces, self._network.patch_spacing, lambda face: distances[face])
 
     @property
     def count(self) -> int:

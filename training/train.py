@@ -24,7 +24,7 @@ import torch
 
 from warpgarment import checkpoint
 from warpgarment.io.atomic import atomic_file
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.network import build_network
 from warpgarment.training.distributed import Group, GroupError
 from warpgarment.training.loader import Plan
 from warpgarment.training.objective import CompileFailed
@@ -64,7 +64,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     if config.init is not None:
         network = checkpoint.load(config.init, device=group.device)
     else:
-        network = ManifoldAwareTransformer(config.network_config()).to(group.device)
+        network = build_network(config.network_config()).to(group.device)
     skipped: dict[str, str] = {}
     try:
         sequences = load_sequences(config, network.config, skipped, group)

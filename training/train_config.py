@@ -54,7 +54,7 @@ class TrainConfig:
 
     data: Path
     out: Path
-    network: Literal["small", "base"] = "small"
+    network: Literal["small", "base", "fast"] = "small"
     overrides: tuple[str, ...] = ("dropout=0.0",)
     init: Path | None = None
     steps: int | None = None

@@ -17,6 +17,7 @@ from warpgarment.garment import Garment
 from warpgarment.kernels.laplacian import components
 from warpgarment.network import NetworkConfig, geodesic_weights
 from warpgarment.parametrisation import NetworkOutput
+from warpgarment.patches import PatchLayout, garment_patches, patch_layout
 
 TOKENS_PER_VIEW = 131_072  # faces in one call of the network: bounds its activations to a few GB
 WEIGHTS_PER_VIEW = 2**30  # entries of geodesic weights in one call: 4 GB
@@ -130,7 +131,7 @@ class PaddedView:
     face_mask: torch.Tensor | None  # bool [R,N]; None where nothing is padded
     component_index: torch.Tensor  # int64 [R,C], into the packed components; 0 where padded
     component_mask: torch.Tensor | None  # bool [R,C]
-    weights: torch.Tensor  # geodesic weights, [R,N,N] or [1,N,N]
+    weights: torch.Tensor | PatchLayout  # geodesic weights, [R,N,N] or [1,N,N]; or patches, of R rows or one
     share: torch.Tensor  # [R], one over the number of rows of the same garment
     in_order: bool  # the view is the packed batch itself, in one row
 
@@ -169,10 +170,13 @@ def padded_views(
         garments: The same garments, for their geodesic distances.
         config: Of the network.
         face_splits: Disjoint subsets of faces per garment, each seen by the network alone: faces s, s+n, s+2n, ...
-            Attention costs n times less, and a face no longer hears all others.
+            Attention costs n times less, and a face no longer hears all others. A network of patches sees whole
+            garments always.
     """
     if face_splits < 1:
         raise ValueError(f"face_splits must be at least 1, got {face_splits}")
+    if config.architecture == "patches":
+        face_splits = 1
     rows = []  # (garment, first face, faces)
     for number, garment in enumerate(garments):
         faces = len(garment.faces)
@@ -208,9 +212,14 @@ def _view(
         mine = range(packed.component_offsets[g], packed.component_offsets[g + 1])
         component_index[r, : len(mine)] = mine
 
-    if not config.manifold_heads:
+    weights: torch.Tensor | PatchLayout
+    shared = len({(id(garments[g]), first) for g, first, _ in rows}) == 1
+    if config.architecture == "patches":
+        shown = [garment_patches(garments[g], config.patch_spacing) for g, _, _ in (rows[:1] if shared else rows)]
+        weights = patch_layout(shown, config.geodesic_radius, config.geodesic_power, device)
+    elif not config.manifold_heads:
         weights = torch.zeros((1, 0, 0), device=device)
-    elif len({(id(garments[g]), first) for g, first, _ in rows}) == 1:
+    elif shared:
         weights = _weights(garments[rows[0][0]], rows[0][1], face_splits, config, device)[None]
     else:
         weights = torch.zeros((len(rows), faces, faces), device=device)

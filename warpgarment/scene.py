@@ -20,7 +20,7 @@ from warpgarment.kernels.deformation import face_centroids, inverse_rest_frames,
 from warpgarment.kernels.features import LAYOUT, BodyInteraction, body_interaction, face_features
 from warpgarment.kernels.poisson import PoissonSolver
 from warpgarment.kernels.sdf import BodyMeshes
-from warpgarment.network import ManifoldAwareTransformer, NetworkOutput
+from warpgarment.network import GarmentNetwork, NetworkOutput
 from warpgarment.parametrisation import Step, compose, context
 from warpgarment.pins import BodyPins, mean_response
 from warpgarment.timing import Timings
@@ -59,7 +59,7 @@ class Scene:
         bodies: PackedBodies,
         body_vertices: torch.Tensor,
         first_vertices: torch.Tensor,
-        network: ManifoldAwareTransformer,
+        network: GarmentNetwork,
         *,
         face_splits: int,
         epsilon: float | None,

@@ -22,7 +22,7 @@ from warpgarment.errors import MeshError
 from warpgarment.garment import Garment
 from warpgarment.history import History
 from warpgarment.motion import GarmentMotion
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.network import GarmentNetwork
 from warpgarment.scene import Scene
 from warpgarment.state import SimulationState
 from warpgarment.status import RolloutStatus
@@ -48,7 +48,7 @@ class Simulator:
 
     def __init__(
         self,
-        network: ManifoldAwareTransformer,
+        network: GarmentNetwork,
         device: torch.device | str | None = None,
         *,
         epsilon: float | None = None,

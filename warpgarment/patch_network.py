@@ -1,0 +1,165 @@
+"""A network whose cost is linear in the faces: a transformer over patches of cloth, between layers of faces.
+
+    features [N, H*34] -> linear -> N faces -> face layer -+--------------------------> (+) -> face layers -> Psi, Sigma
+                                                           v pool                       ^ spread
+                                                           P patches -> encoder layers -+
+    velocities [C, (H-1)*3] -> linear, + linear(mean) --> C tokens  ->  (attention.py) ------------------------> q
+
+The mean is that of the piece of cloth that the velocities are of. `patches.py` says how faces are pooled into patches
+and hear of them again. The encoder layers are those of the manifold-aware transformer, with geodesic distances between
+the patches' centres. A face layer is a small perceptron on each face; those after the patches also see the mean of its
+neighbours across the edges, so that folds much smaller than a patch are kept. At first they do not listen to it, so a
+network may be trained on subsets of faces, which have no neighbours, before it is on whole garments.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from warpgarment.attention import ACTIVATIONS, EncoderLayer
+from warpgarment.config import NetworkConfig
+from warpgarment.garment_network import GarmentNetwork, NormalisedOutput
+from warpgarment.kernels.features import FEATURES
+from warpgarment.patches import PatchLayout
+
+
+class FaceLayer(nn.Module):
+    """A residual perceptron on every face, normalised before.
+
+    Args:
+        embedding: Width of a face.
+        feed_forward: Width of the hidden layer.
+        activation: "relu" or "gelu".
+        hears: Whether the hidden layer also sees the mean of the face's neighbours; at first it does not listen.
+    """
+
+    def __init__(self, embedding: int, feed_forward: int, activation: str, hears: bool) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(embedding)
+        self.expand = nn.Linear(embedding, feed_forward)
+        self.contract = nn.Linear(feed_forward, embedding)
+        self.activation = ACTIVATIONS[activation]
+        if hears:
+            self.hear = nn.Linear(embedding, feed_forward, bias=False)
+            nn.init.zeros_(self.hear.weight)
+        self.hears = hears
+
+    def forward(self, x: torch.Tensor, neighbours: torch.Tensor | None) -> torch.Tensor:
+        """Faces of all garments [F,E] and their neighbours, int64 [F,3], None where there are none -> [F,E]."""
+        own = self.norm(x)
+        hidden = self.expand(own)
+        if self.hears:
+            around = torch.zeros_like(own) if neighbours is None else F.embedding_bag(neighbours, own, mode="mean")
+            hidden = hidden + self.hear(around)
+        return x + self.contract(self.activation(hidden))
+
+
+class PatchTransformer(GarmentNetwork):
+    """Faces, pooled into patches, which attend to each other.
+
+    Args:
+        config: Its shape and settings; `NetworkConfig.fast()` is the named one.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        width = config.face_embedding
+        self.embed_faces = nn.Linear(config.history * FEATURES, width)
+        self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
+        self.before = self._face_layer(hears=False)
+        self.to_patches = nn.Linear(width, config.embedding)
+        self.to_velocity = nn.Linear(width, config.embedding, bias=False)
+        self.layers = nn.ModuleList(
+            EncoderLayer(
+                config.embedding,
+                config.feed_forward,
+                config.heads,
+                config.manifold_heads,
+                dropout=config.dropout,
+                norm_first=config.norm_first,
+                activation=config.activation,
+            )
+            for _ in range(config.layers)
+        )
+        self.final_norm = nn.LayerNorm(config.embedding) if config.norm_first else nn.Identity()
+        self.from_patches = nn.Linear(config.embedding, width)
+        self.after = nn.ModuleList(self._face_layer(hears=True) for _ in range(config.face_layers))
+        self.face_norm = nn.LayerNorm(width)
+        self.face_head = nn.Linear(width, 12)
+        self.velocity_head = nn.Linear(config.embedding, 3)
+        self.start_like_skin()
+
+    def _face_layer(self, *, hears: bool) -> FaceLayer:
+        config = self.config
+        return FaceLayer(config.face_embedding, config.face_feed_forward, config.activation, hears)
+
+    def forward_normalised(
+        self,
+        x: torch.Tensor,
+        v: torch.Tensor,
+        weights: PatchLayout,
+        *,
+        face_mask: torch.Tensor | None = None,
+        velocity_mask: torch.Tensor | None = None,
+    ) -> NormalisedOutput:
+        """The network itself: normalised inputs to normalised outputs, shapes as in `forward`."""
+        if face_mask is not None:
+            x = torch.where(face_mask[..., None], x, 0.0)  # whatever padding holds, NaN too, must not spread
+        if velocity_mask is not None:
+            v = torch.where(velocity_mask[..., None], v, 0.0)
+        kind = x.device.type
+        half = torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False):  # velocities are differences of frames that bfloat16 would round away
+            faces, tokens = self.embed_faces(x), self.embed_velocity(v)
+        batch, count = faces.shape[:2]
+        patches = weights.start.shape[1]
+        row = torch.arange(batch, device=x.device)[:, None, None]
+        neighbours = None if weights.neighbours is None else (weights.neighbours + count * row).flatten(0, 1)
+
+        faces = self.before(faces.flatten(0, 1), neighbours)
+        pooled = F.embedding_bag(
+            (weights.member + count * row[..., 0]).flatten(),
+            faces,
+            (weights.start + weights.member.shape[1] * row[..., 0]).flatten(),
+            mode="sum",
+            per_sample_weights=_rows(weights.member_weight, batch).flatten().to(faces.dtype),
+        )
+        pooled = pooled.unflatten(0, (batch, patches))
+        mean = _rows(weights.pieces, batch).to(pooled.dtype) @ pooled
+        tokens = torch.cat([self.to_patches(pooled), tokens + self.to_velocity(mean)], dim=1)
+        geodesic = weights.weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
+        mask = self._key_mask(weights, velocity_mask, v)
+        for layer in self.layers:
+            tokens = layer(tokens, geodesic, mask)
+        tokens = self.final_norm(tokens)
+        heard = self.from_patches(tokens[:, :patches]).flatten(0, 1)
+        faces = faces + F.embedding_bag(
+            (weights.patch + patches * row).flatten(0, 1),
+            heard,
+            mode="sum",
+            per_sample_weights=_rows(weights.share, batch).flatten(0, 1).to(heard.dtype),
+        )
+        for layer in self.after:
+            faces = layer(faces, neighbours)
+        with torch.autocast(kind, enabled=False):
+            precise = self.face_head.weight.dtype
+            answer = self.face_head(self.face_norm(faces.to(precise))).unflatten(0, (batch, count))
+            psi, singular_values = answer.split([9, 3], dim=-1)
+            return NormalisedOutput(psi, singular_values, self.velocity_head(tokens[:, patches:].to(precise)))
+
+    @staticmethod
+    def _key_mask(weights: PatchLayout, velocity_mask: torch.Tensor | None, v: torch.Tensor) -> torch.Tensor | None:
+        """True where a token is real, shape [B,1,1,P+C]; None where all are."""
+        if weights.mask is None and velocity_mask is None:
+            return None
+        real = torch.ones((), dtype=torch.bool, device=v.device)
+        patch_mask = real.expand(*weights.start.shape) if weights.mask is None else weights.mask
+        velocity_mask = real.expand(*v.shape[:2]) if velocity_mask is None else velocity_mask
+        return torch.cat([patch_mask.expand(len(v), -1), velocity_mask], dim=1)[:, None, None]
+
+
+def _rows(values: torch.Tensor, batch: int) -> torch.Tensor:
+    """One row for each of the batch, where all share one."""
+    return values.expand(batch, *values.shape[1:])
