@@ -19,7 +19,14 @@ from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
 from warpgarment.garment import Garment
 from warpgarment.kernels.features import FEATURES
-from warpgarment.network import STATISTICS, ManifoldAwareTransformer, NetworkConfig, PatchTransformer, build_network
+from warpgarment.network import (
+    STATISTICS,
+    ManifoldAwareTransformer,
+    NetworkConfig,
+    PatchTransformer,
+    build_network,
+    rotate_output,
+)
 from warpgarment.patches import PatchLayout, garment_patches, patch_layout
 from warpgarment.training.flops import forward_flops
 
@@ -128,6 +135,23 @@ def test_matches_numpy():
     expected = linear("face_head", norm("face_norm", h))
     close(torch.cat([result.psi, result.singular_values], dim=2)[0].detach(), expected, 1e-5)
     close(result.velocity[0].detach(), linear("velocity_head", tokens[count:]), 1e-5)
+
+
+@pytest.mark.parametrize("direction", ["world", "canonical"])
+def test_forward_is_the_steps_that_training_takes(direction):
+    """A rollout would use another network than training made: forward turns and normalises weights, not features.
+
+    One garment and several; 1e-5: float32 in another order, on outputs around one.
+    """
+    network = tiny(heading=direction)
+    for batch in (1, 3):
+        features, velocities = inputs(batch, len(PIECES.faces), 2)
+        result, weights = network(features, velocities, layout(PIECES)), layout(PIECES)
+        turned, v, frame = network.canonicalise(features, velocities)
+        normalised = network.forward_normalised(*network.encode(turned, v), weights)
+        expected = rotate_output(network.denormalise(normalised), frame, inverse=True)
+        for a, b in zip(result, expected, strict=True):
+            close(a.detach(), b.detach(), 1e-5)
 
 
 def test_a_padded_batch_is_its_rows():

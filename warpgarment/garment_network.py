@@ -155,8 +155,11 @@ class GarmentNetwork(nn.Module):
     def encode(self, face_features: torch.Tensor, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Normalises (canonical) inputs; the same statistics serve all frames of the history."""
         x = (face_features.unflatten(-1, (-1, FEATURES)) - self.feature_mean) / self.feature_std
-        v = (velocities.unflatten(-1, (-1, 3)) - self.velocity_mean) / self.velocity_std
-        return x.flatten(-2), v.flatten(-2)
+        return x.flatten(-2), self.encode_velocities(velocities)
+
+    def encode_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
+        """Normalises (canonical) velocities."""
+        return ((velocities.unflatten(-1, (-1, 3)) - self.velocity_mean) / self.velocity_std).flatten(-2)
 
     def forward_normalised(
         self,

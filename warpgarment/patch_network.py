@@ -18,10 +18,12 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from warpgarment import heading
 from warpgarment.attention import ACTIVATIONS, EncoderLayer
 from warpgarment.config import NetworkConfig
-from warpgarment.garment_network import GarmentNetwork, NormalisedOutput
+from warpgarment.garment_network import GarmentNetwork, NormalisedOutput, rotate_output
 from warpgarment.kernels.features import FEATURES
+from warpgarment.parametrisation import NetworkOutput
 from warpgarment.patches import PatchLayout
 
 
@@ -95,6 +97,46 @@ class PatchTransformer(GarmentNetwork):
         config = self.config
         return FaceLayer(config.face_embedding, config.face_feed_forward, config.activation, hears)
 
+    def forward(
+        self,
+        face_features: torch.Tensor,
+        velocities: torch.Tensor,
+        weights: PatchLayout,
+        *,
+        face_mask: torch.Tensor | None = None,
+        velocity_mask: torch.Tensor | None = None,
+    ) -> NetworkOutput:
+        """As in `GarmentNetwork`, with the turn and the normalisation of the features done to the first weights."""
+        kind = face_features.device.type
+        half = torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False):  # half precision is for the transformer, not for positions
+            frame = None
+            if self.config.heading == "canonical":
+                frame = heading.canonical_frame(face_features, face_mask)
+                velocities = heading.rotate_vectors(velocities, frame)
+            if face_mask is not None:
+                face_features = torch.where(face_mask[..., None], face_features, 0.0)
+            faces = self._embedded(face_features, frame)
+            tokens = self.embed_velocity(self._without_padding(self.encode_velocities(velocities), velocity_mask))
+        with torch.autocast(kind, dtype=torch.get_autocast_dtype(kind), enabled=half):
+            normalised = self._from_embeddings(faces, tokens, weights, velocity_mask)
+        with torch.autocast(kind, enabled=False):
+            return rotate_output(self.denormalise(normalised), frame, inverse=True)
+
+    def _embedded(self, face_features: torch.Tensor, frame: torch.Tensor | None) -> torch.Tensor:
+        """What `embed_faces` makes of turned and normalised features, from those as they are.
+
+        W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
+        """
+        scaled = self.embed_faces.weight.unflatten(1, (-1, FEATURES)) / self.feature_std  # [E,H,34]
+        bias = self.embed_faces.bias - scaled.sum(dim=1) @ self.feature_mean
+        if frame is None:
+            return F.linear(face_features, scaled.flatten(1), bias)
+        turned = torch.einsum("ehi,bij->behj", scaled, heading.feature_rotation(frame)).flatten(2)
+        if len(turned) == 1:
+            return F.linear(face_features, turned[0], bias)
+        return torch.baddbmm(bias, face_features, turned.mT)
+
     def forward_normalised(
         self,
         x: torch.Tensor,
@@ -105,17 +147,23 @@ class PatchTransformer(GarmentNetwork):
         velocity_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
         """The network itself: normalised inputs to normalised outputs, shapes as in `forward`."""
-        if face_mask is not None:
-            x = torch.where(face_mask[..., None], x, 0.0)  # whatever padding holds, NaN too, must not spread
-        if velocity_mask is not None:
-            v = torch.where(velocity_mask[..., None], v, 0.0)
-        kind = x.device.type
-        half = torch.is_autocast_enabled(kind)
-        with torch.autocast(kind, enabled=False):  # velocities are differences of frames that bfloat16 would round away
+        x, v = self._without_padding(x, face_mask), self._without_padding(v, velocity_mask)
+        with torch.autocast(x.device.type, enabled=False):  # differences of frames, which bfloat16 would round away
             faces, tokens = self.embed_faces(x), self.embed_velocity(v)
+        return self._from_embeddings(faces, tokens, weights, velocity_mask)
+
+    @staticmethod
+    def _without_padding(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+        """Zero where padded: whatever padding holds, NaN too, must not spread."""
+        return values if mask is None else torch.where(mask[..., None], values, 0.0)
+
+    def _from_embeddings(
+        self, faces: torch.Tensor, tokens: torch.Tensor, weights: PatchLayout, velocity_mask: torch.Tensor | None
+    ) -> NormalisedOutput:
+        """Embedded faces [B,N,F] and velocities [B,C,E] -> normalised output."""
         batch, count = faces.shape[:2]
         patches = weights.start.shape[1]
-        row = torch.arange(batch, device=x.device)[:, None, None]
+        row = torch.arange(batch, device=faces.device)[:, None, None]
         neighbours = None if weights.neighbours is None else (weights.neighbours + count * row).flatten(0, 1)
 
         faces = self.before(faces.flatten(0, 1), neighbours)
@@ -129,8 +177,10 @@ class PatchTransformer(GarmentNetwork):
         pooled = pooled.unflatten(0, (batch, patches))
         mean = _rows(weights.pieces, batch).to(pooled.dtype) @ pooled
         tokens = torch.cat([self.to_patches(pooled), tokens + self.to_velocity(mean)], dim=1)
+        kind = faces.device.type
+        half = torch.is_autocast_enabled(kind)
         geodesic = weights.weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
-        mask = self._key_mask(weights, velocity_mask, v)
+        mask = self._key_mask(weights, velocity_mask, mean)
         for layer in self.layers:
             tokens = layer(tokens, geodesic, mask)
         tokens = self.final_norm(tokens)

@@ -144,7 +144,8 @@ def _farthest_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Centres [P] and their distances to all faces, float64 [P,F]."""
     nearest = np.full(len(centroids), np.inf)
-    centres, rows = [], []
+    centres: list[int] = []
+    rows: list[np.ndarray] = []
     while True:
         face = int(np.argmax(nearest))
         if nearest[face] <= spacing:
@@ -196,16 +197,15 @@ def patch_layout(
     member = np.zeros((rows, faces * SHARES), np.int64)
     member_weight = np.zeros((rows, faces * SHARES), np.float32)
     start = np.zeros((rows, count), np.int64)
-    neighbours = None
-    if garments[0].neighbours is not None:
-        neighbours = np.broadcast_to(np.arange(faces)[None, :, None], (rows, faces, 3)).copy()
+    whole = garments[0].neighbours is not None
+    neighbours = np.broadcast_to(np.arange(faces)[None, :, None], (rows, faces, 3)).copy()
     distances = np.full((rows, count, count), np.inf, np.float32)
     pieces = np.zeros((rows, max(len(p.pieces) for p in garments), count), np.float32)
     real = np.zeros((rows, count), bool)
     for r, mine in enumerate(garments):
         f, p = mine.patch.shape[0], len(mine.centres)
         patch[r, :f], share[r, :f] = mine.patch, mine.share
-        if neighbours is not None:
+        if mine.neighbours is not None:
             neighbours[r, :f] = mine.neighbours
         member[r, : f * SHARES], member_weight[r, : f * SHARES] = mine.member, mine.member_weight
         start[r, :p], start[r, p:] = mine.start, f * SHARES
@@ -217,8 +217,12 @@ def patch_layout(
         return torch.from_numpy(array).to(device)
 
     return PatchLayout(
-        *(send(array) for array in (patch, share, member, member_weight, start)),
-        neighbours=None if neighbours is None else send(neighbours),
+        patch=send(patch),
+        share=send(share),
+        member=send(member),
+        member_weight=send(member_weight),
+        start=send(start),
+        neighbours=send(neighbours) if whole else None,
         pieces=send(pieces),
         weights=geodesic_weights(send(distances), radius, power),
         mask=None if real.all() else send(real),
