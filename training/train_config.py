@@ -21,7 +21,7 @@ class TrainConfig:
     Attributes:
         data: Folder of sequences.
         out: Folder for everything that is written.
-        network: Shape to start from.
+        network: Shape to start from; "fast" is a network of patches, see patch_network.py.
         overrides: Changes to it, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
         init: Checkpoint to start from instead of random weights (its shape and statistics are kept).
         steps: Number of steps; None: as many as `time_limit` allows.

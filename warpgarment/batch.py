@@ -187,7 +187,9 @@ def padded_views(
     for row in rows:
         if groups:
             longest, together = groups[-1][0][2], len(groups[-1]) + 1
-            fits = together * longest <= TOKENS_PER_VIEW and together * longest**2 <= WEIGHTS_PER_VIEW
+            fits = together * longest <= TOKENS_PER_VIEW
+            if config.architecture == "faces":
+                fits = fits and together * longest**2 <= WEIGHTS_PER_VIEW
             if fits and longest <= PADDING * row[2]:
                 groups[-1].append(row)
                 continue
