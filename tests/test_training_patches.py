@@ -124,12 +124,12 @@ def test_run_goes_from_subsets_to_whole_garments(data, tmp_path, monkeypatch):
 def test_named_network():
     """`--network fast` would train another network than the one described.
 
-    Faces of width F = 96, G = 128: an embedding of 341 F = 32,736; layers of 2 F norms, 2 F G + G + F = 24,800, two of
-    which also hear, F G = 12,288; a norm of 192 and a head of 97 * 12 = 1,164. Patches of width E = 128: four layers of
-    116,032 (see test_network), a norm of 256, 28 E = 3,584, to and from the faces 97 E + 129 F = 24,800, the mean 96 E
-    = 12,288, and the head 129 * 3 = 387.
+    Faces of width F = 128, G = 128: an embedding of 341 F = 43,648; layers of 2 F norms, 2 F G + G + F = 33,024, two of
+    which also hear, F G = 16,384; a norm of 256 and a head of 129 * 12 = 1,548. Patches of width E = 128: four layers
+    of 116,032 (see test_network), a norm of 256, 28 E = 3,584, to and from the faces 2 * 129 E = 33,024, the mean E^2 =
+    16,384, and the head 129 * 3 = 387.
     """
     config = train.TrainConfig(Path(), Path(), network="fast", overrides=(), steps=1).network_config()
     assert config == NetworkConfig.fast()
-    faces = 32_736 + 3 * (192 + 24_800) + 2 * 12_288 + 192 + 1_164
-    assert PatchTransformer(config).parameter_count() == faces + 4 * 116_032 + 256 + 3_584 + 24_800 + 12_288 + 387
+    faces = 43_648 + 3 * (256 + 33_024) + 2 * 16_384 + 256 + 1_548
+    assert PatchTransformer(config).parameter_count() == faces + 4 * 116_032 + 256 + 3_584 + 33_024 + 16_384 + 387

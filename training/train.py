@@ -24,7 +24,7 @@ import torch
 
 from warpgarment import checkpoint
 from warpgarment.io.atomic import atomic_file
-from warpgarment.network import build_network
+from warpgarment.network import ManifoldAwareTransformer, PatchTransformer, build_network
 from warpgarment.training.distributed import Group, GroupError
 from warpgarment.training.loader import Plan
 from warpgarment.training.objective import CompileFailed
@@ -63,6 +63,9 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     torch.manual_seed(config.seed)
     if config.init is not None:
         network = checkpoint.load(config.init, device=group.device)
+        wanted = config.network_config()
+        if isinstance(network, ManifoldAwareTransformer) and wanted.architecture == "patches":
+            network = PatchTransformer.from_faces(network, wanted).to(group.device)
     else:
         network = build_network(config.network_config()).to(group.device)
     skipped: dict[str, str] = {}

@@ -23,7 +23,8 @@ class TrainConfig:
         out: Folder for everything that is written.
         network: Shape to start from; "fast" is a network of patches, see patch_network.py.
         overrides: Changes to it, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
-        init: Checkpoint to start from instead of random weights (its shape and statistics are kept).
+        init: Checkpoint to start from instead of random weights (its shape and statistics are kept). A network of
+            patches may start from one of faces: see `PatchTransformer.from_faces`.
         steps: Number of steps; None: as many as `time_limit` allows.
         time_limit: Minutes after which the run stops cleanly, everything counted; None: no limit.
         batch_size: Samples per step, of all processes together; they share them evenly.

@@ -30,7 +30,7 @@ class NetworkConfig:
     fps: float = 30.0  # of the motions it was trained on
     architecture: str = "faces"  # every face a token; or "patches", see patch_network.py, to which alone belong:
     patch_spacing: float = 0.08  # metres between patches; `embedding` and `feed_forward` are those of their tokens
-    face_embedding: int = 96
+    face_embedding: int = 128
     face_feed_forward: int = 128
     face_layers: int = 2  # after the patches have been heard; one more goes before
 

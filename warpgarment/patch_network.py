@@ -1,7 +1,7 @@
 """A network whose cost is linear in the faces: a transformer over patches of cloth, between layers of faces.
 
     features [N, H*34] -> linear -> N faces -> face layer -+--------------------------> (+) -> face layers -> Psi, Sigma
-                                                           v pool                       ^ spread
+                                                           v pool                       ^ spread what changed
                                                            P patches -> encoder layers -+
     velocities [C, (H-1)*3] -> linear, + linear(mean) --> C tokens  ->  (attention.py) ------------------------> q
 
@@ -14,6 +14,8 @@ network may be trained on subsets of faces, which have no neighbours, before it 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -25,6 +27,9 @@ from warpgarment.garment_network import GarmentNetwork, NormalisedOutput, rotate
 from warpgarment.kernels.features import FEATURES
 from warpgarment.parametrisation import NetworkOutput
 from warpgarment.patches import PatchLayout
+
+if TYPE_CHECKING:
+    from warpgarment.network import ManifoldAwareTransformer
 
 
 class FaceLayer(nn.Module):
@@ -92,6 +97,43 @@ class PatchTransformer(GarmentNetwork):
         self.face_head = nn.Linear(width, 12)
         self.velocity_head = nn.Linear(config.embedding, 3)
         self.start_like_skin()
+
+    @classmethod
+    def from_faces(cls, network: ManifoldAwareTransformer, config: NetworkConfig) -> PatchTransformer:
+        """A network of patches that starts from a trained one of faces, for training to go on.
+
+        Its layers are done to patches, faces hear how these changed, and face layers do nothing yet. If every face were
+        a patch, it would be the same network.
+
+        Args:
+            network: Whose weights and statistics are copied.
+            config: Of the new network, with the same widths (faces as wide as patches), layers, heads and history.
+
+        Raises:
+            ValueError: They differ, or the network normalises after its layers; says in what.
+        """
+        old = network.config
+        shared = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "history", "residual", "heading",
+                  "norm_first", "activation")  # fmt: skip
+        other = [name for name in shared if getattr(old, name) != getattr(config, name)]
+        if config.face_embedding != old.embedding:
+            other.append("face_embedding")
+        if other:
+            raise ValueError(f"a network of patches cannot start from this one of faces: {', '.join(other)} differ")
+        if not old.norm_first:
+            raise ValueError("a network of patches can only start from one with norm_first")
+        made = cls(config)
+        wanted = made.state_dict()
+        made.load_state_dict(wanted | {k: v for k, v in network.state_dict().items() if k in wanted})
+        made.face_norm.load_state_dict(network.final_norm.state_dict())
+        for linear in (made.to_patches, made.from_patches):
+            nn.init.eye_(linear.weight)
+            nn.init.zeros_(linear.bias)
+        nn.init.zeros_(made.to_velocity.weight)
+        for layer in (made.before, *made.after):
+            nn.init.zeros_(layer.contract.weight)
+            nn.init.zeros_(layer.contract.bias)
+        return made
 
     def _face_layer(self, *, hears: bool) -> FaceLayer:
         config = self.config
@@ -181,10 +223,11 @@ class PatchTransformer(GarmentNetwork):
         half = torch.is_autocast_enabled(kind)
         geodesic = weights.weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
         mask = self._key_mask(weights, velocity_mask, mean)
+        before = tokens
         for layer in self.layers:
             tokens = layer(tokens, geodesic, mask)
+        heard = self.from_patches((tokens - before)[:, :patches]).flatten(0, 1)
         tokens = self.final_norm(tokens)
-        heard = self.from_patches(tokens[:, :patches]).flatten(0, 1)
         faces = faces + F.embedding_bag(
             (weights.patch + patches * row).flatten(0, 1),
             heard,
