@@ -11,7 +11,7 @@ import torch
 from training_runs import config_for, losses_of
 
 from warpgarment import checkpoint
-from warpgarment.network import NetworkConfig, PatchTransformer
+from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, PatchTransformer
 from warpgarment.parametrisation import NetworkOutput
 from warpgarment.patches import garment_patches, patch_layout
 from warpgarment.training import interactions, train
@@ -119,6 +119,25 @@ def test_run_goes_from_subsets_to_whole_garments(data, tmp_path, monkeypatch):
         train.train(config_for(data, tmp_path / "parts", **settings))
     train.train(config_for(data, tmp_path / "parts", **settings, resume=True))
     assert losses_of(tmp_path / "parts") == losses
+
+
+def test_run_starts_from_a_network_of_faces(data, tmp_path):
+    """`init` would be ignored, or train the network of faces it names instead of one of patches.
+
+    With a rate of nothing, what is saved is what it started from.
+    """
+    faces = ManifoldAwareTransformer(NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2))
+    torch.nn.init.normal_(faces.velocity_head.weight)
+    faces.save(tmp_path / "faces.safetensors")
+    settings = {"network": "fast", "overrides": SHAPE, "init": tmp_path / "faces.safetensors", "lr": 0.0, "steps": 1}
+    path = train.train(config_for(data, tmp_path / "run", **settings))
+    found = checkpoint.load(path)
+    assert type(found) is PatchTransformer
+    weights = found.state_dict()
+    for name, value in faces.state_dict().items():
+        assert torch.equal(weights[name.replace("final_norm", "face_norm")], value), name
+    assert torch.equal(weights["from_patches.weight"], torch.eye(16))
+    assert not any(layer.contract.weight.any() for layer in (found.before, *found.after))
 
 
 def test_named_network():
