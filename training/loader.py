@@ -57,7 +57,8 @@ class Loader:
         plan: Says which samples.
         pool: What the network's own rollouts did wrong, mixed in as `share` of the samples.
         share: Share of samples from the pool, where it has any that fit.
-        splits: Number of subsets that a garment's faces are split into at a step; one of them is used.
+        splits: Number of subsets that a garment's faces are split into at a step; one of them is used. At 1, a
+            network of patches is shown whole garments, others as much of each as its batch's smallest has.
         depth: Batches built ahead; 0 builds them when asked, without a thread.
         part: The samples of each batch that this process trains on.
     """
@@ -82,14 +83,19 @@ class Loader:
         rng = np.random.default_rng((self.plan.seed, 1, step))
         picks = self.plan.picks(step)
         splits = self.splits(step) if splits is None else splits
-        faces = max(min(int(self.plan.sizes[s]) for s, _ in picks) // splits, 1)
+        sizes = [int(self.plan.sizes[s]) for s, _ in picks]
+        whole = self.builder.patches and splits == 1
+        faces = max(sizes) if whole else max(min(sizes) // splits, 1)
         displacements: list[np.ndarray | None] = [None] * len(picks)
-        fitting = [entry for entry in self.pool.fitting(self.plan.sizes, faces) if self._reaches(*entry)]
+        fitting = self.pool.fitting(self.plan.sizes, faces, whole=whole)
+        fitting = [entry for entry in fitting if self._reaches(*entry)]
         for b in range(len(picks)):
             if len(fitting) and rng.random() < self.share:
                 s, t, displacements[b] = self.pool.entry(*fitting[rng.integers(len(fitting))])
                 picks[b] = (s, t)
-        return self.builder.build(picks, faces, rng, displacements, self.part if part is None else part)
+        return self.builder.build(
+            picks, None if whole else faces, rng, displacements, self.part if part is None else part
+        )
 
     def _reaches(self, rollout: int, last: int) -> bool:
         """Whether enough recorded frames follow a frame of the pool."""
@@ -144,6 +150,6 @@ def _adopt(batch: Batch, built: torch.cuda.Event) -> None:
     """Makes the current stream wait for a batch of another one, and its memory wait for the current stream."""
     stream = torch.cuda.current_stream(batch.features.device)
     stream.wait_event(built)
-    for tensor in (*batch[:5], *batch.target):
+    for tensor in torch.utils._pytree.tree_leaves(tuple(batch)):
         if isinstance(tensor, torch.Tensor):
             tensor.record_stream(stream)

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 import torch
 
-from warpgarment.network import ManifoldAwareTransformer, NormalisedOutput
+from warpgarment.network import GarmentNetwork, NormalisedOutput
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,12 @@ class Losses(NamedTuple):
 def loss(
     predicted: NormalisedOutput,
     target: NormalisedOutput,
-    network: ManifoldAwareTransformer,
+    network: GarmentNetwork,
     config: LossConfig,
     velocity_mask: torch.Tensor | None = None,
     components: torch.Tensor | None = None,
+    face_mask: torch.Tensor | None = None,
+    faces: torch.Tensor | None = None,
 ) -> Losses:
     """Loss of a batch, in float32.
 
@@ -56,9 +58,16 @@ def loss(
         components: Number of components that the velocity term is a mean over, a scalar; None: those of this batch. For
             a part of a batch, the whole batch's number times the share that the part is: then the mean over equal parts
             is the loss of the whole.
+        face_mask: True where a face is real, [B,N]; None where all are.
+        faces: Of faces what `components` is of components.
     """
     deformation, singular_values, velocity = _differences(predicted, target, network, config)
-    deformation, singular_values = deformation.mean(), singular_values.mean()
+    if face_mask is not None:
+        deformation, singular_values = (torch.where(face_mask, part, 0.0) for part in (deformation, singular_values))
+        faces = face_mask.sum() if faces is None else faces
+    deformation, singular_values = (
+        part.mean() if faces is None else part.sum() / faces for part in (deformation, singular_values)
+    )
     if velocity_mask is not None:
         velocity = torch.where(velocity_mask, velocity, 0.0)
         components = velocity_mask.sum() if components is None else components

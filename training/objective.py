@@ -12,8 +12,9 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.network import GarmentNetwork
 from warpgarment.parametrisation import NetworkOutput
+from warpgarment.patches import PatchLayout
 from warpgarment.training.distributed import Group
 from warpgarment.training.losses import LossConfig, loss
 from warpgarment.training.samples import Batch
@@ -37,7 +38,7 @@ class Objective(nn.Module):
 
     figures = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity")
 
-    def __init__(self, network: ManifoldAwareTransformer, config: LossConfig, noise: float, precision: str) -> None:
+    def __init__(self, network: GarmentNetwork, config: LossConfig, noise: float, precision: str) -> None:
         super().__init__()
         self.network, self.config, self.noise, self.half = network, config, noise, precision == "bfloat16"
 
@@ -51,16 +52,20 @@ class Objective(nn.Module):
             batch.velocity_mask,
             batch.components,
             tuple(batch.target),
+            batch.face_mask,
+            batch.faces,
         )
 
     def forward(
         self,
         features: torch.Tensor,
         velocities: torch.Tensor,
-        weights: torch.Tensor,
+        weights: torch.Tensor | PatchLayout,
         velocity_mask: torch.Tensor | None,
         components: torch.Tensor,
         target: tuple[torch.Tensor, ...],
+        face_mask: torch.Tensor | None = None,
+        faces: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """The fields of `Batch`; returns [4], the numbers of `Losses`, in float32."""
         network = self.network
@@ -69,9 +74,11 @@ class Objective(nn.Module):
             x = x + self.noise * torch.randn_like(x)
             v = v + self.noise * torch.randn_like(v)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
-            predicted = network.forward_normalised(x, v, weights, velocity_mask=velocity_mask)
+            predicted = network.forward_normalised(x, v, weights, face_mask=face_mask, velocity_mask=velocity_mask)
         normalised = network.normalise_targets(NetworkOutput(*target))
-        return torch.stack(loss(predicted, normalised, network, self.config, velocity_mask, components))
+        return torch.stack(
+            loss(predicted, normalised, network, self.config, velocity_mask, components, face_mask, faces)
+        )
 
 
 class Trainer:

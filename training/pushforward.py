@@ -46,12 +46,12 @@ class Pool:
         self.rollouts: list[tuple[int, int, np.ndarray]] = []
         self.step = 0  # of the last refresh
 
-    def fitting(self, sizes: np.ndarray, faces: int) -> list[tuple[int, int]]:
-        """All (rollout, last frame index) whose garment has at least `faces` faces."""
+    def fitting(self, sizes: np.ndarray, faces: int, *, whole: bool = False) -> list[tuple[int, int]]:
+        """All (rollout, last frame index) whose garment has at least `faces` faces, or `whole` at most."""
         return [
             (r, k)
             for r, (s, _, displacement) in enumerate(self.rollouts)
-            if sizes[s] >= faces
+            if (sizes[s] <= faces if whole else sizes[s] >= faces)
             for k in range(len(displacement))
         ]
 

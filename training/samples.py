@@ -10,7 +10,8 @@ too:
 
 so the answer leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces
 and frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but
-components.
+components. A network of patches is shown neighbours where the faces are not a subset: then whole garments make a batch,
+padded with copies of a face that do not count.
 
 Every sample has a stream of random numbers of its own, so that a part of a batch is the same part whoever builds it.
 """
@@ -31,6 +32,7 @@ from warpgarment.kernels.deformation import (
 )
 from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
 from warpgarment.parametrisation import NetworkOutput, Step, context, targets
+from warpgarment.patches import Patches, PatchLayout, patch_layout
 from warpgarment.training.augmentation import Augmentation, mirror
 from warpgarment.training.flops import step_flops
 from warpgarment.training.interactions import COLUMNS, unpack
@@ -46,20 +48,24 @@ class Batch(NamedTuple):
 
     features: torch.Tensor  # [B,N,H*34] oldest first
     velocities: torch.Tensor  # [B,C,(H-1)*3]
-    weights: torch.Tensor  # [B,N,N] geodesic
+    weights: torch.Tensor | PatchLayout  # [B,N,N] geodesic; or patches
     velocity_mask: torch.Tensor | None  # [B,C] bool; None where all garments have C components
     components: torch.Tensor  # scalar: garment components of the whole batch, times the share of it that this is
     target: NetworkOutput  # what the network should say
     ids: list[tuple[str, int]]  # sequence, newest frame
+    face_mask: torch.Tensor | None = None  # [B,N] bool; None where all are real
+    faces: torch.Tensor | None = None  # scalar, as `components`, of real faces; None where all are
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
         """Samples, and operations of a training step on them (`flops.py`)."""
         samples, faces = self.features.shape[:2]
-        return samples, step_flops(config, samples, faces, self.velocities.shape[1])
+        patches = self.weights.start.shape[1] if isinstance(self.weights, PatchLayout) else 0
+        return samples, step_flops(config, samples, faces, self.velocities.shape[1], patches)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is kept of a batch whose loss is not finite."""
-        tensors = {"features": self.features, "velocities": self.velocities, "weights": self.weights}
+        weights = self.weights.weights if isinstance(self.weights, PatchLayout) else self.weights
+        tensors = {"features": self.features, "velocities": self.velocities, "weights": weights}
         return {name: tensor.cpu().numpy() for name, tensor in (tensors | self.target._asdict()).items()}
 
 
@@ -77,6 +83,7 @@ class SampleBuilder:
         self.sequences, self.network = sequences, network
         self.noise, self.augmentation = noise, augmentation
         self.device = sequences[0].device
+        self.patches = network.architecture == "patches"
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the recorded frames that a sample needs follow a frame."""
@@ -86,7 +93,7 @@ class SampleBuilder:
     def build(
         self,
         picks: list[tuple[int, int]],
-        faces: int,
+        faces: int | None,
         rng: np.random.Generator,
         displacements: list[np.ndarray | None] | None = None,
         part: slice = slice(None),
@@ -95,7 +102,8 @@ class SampleBuilder:
 
         Args:
             picks: Sequence index and newest frame of each sample.
-            faces: Number N of faces per sample; every garment has as many.
+            faces: Number N of faces per sample, a random subset; every garment has as many. For a network of patches
+                also None: all of every garment.
             rng: All randomness comes from here: sample b draws from the b-th stream it spawns.
             displacements: Per sample None or [K,V,3] metres, K <= history: an override of the newest K frames, relative
                 to the recorded positions; noise comes on top.
@@ -104,16 +112,20 @@ class SampleBuilder:
         Returns:
             The batch, on the sequences' device.
         """
+        all_faces = sum(len(self.sequences[s].faces) if faces is None else faces for s, _ in picks)
         streams, whole = rng.spawn(len(picks))[part], [self.sequences[s].components for s, _ in picks]
         picks, real = picks[part], whole[part]
         displacements = displacements[part] if displacements else [None] * len(picks)
         history, device, count, components = self.network.history, self.device, len(picks), max(real)
+        sizes = [len(self.sequences[s].faces) if faces is None else faces for s, _ in picks]
+        whole_garments, faces = faces is None, max(sizes)
         turn, similarity, joint, mirrored, scale = self._drawn(picks, streams)
 
         positions, following, corners, next_corners, means = [], [], [], [], []
         rows = torch.empty(count, faces, history, 16, device=device)
         inverse_rest = torch.empty(count, faces, 3, 3, device=device)
-        weights = torch.empty(count, faces, faces, device=device)
+        weights = None if self.patches else torch.empty(count, faces, faces, device=device)
+        shown: list[Patches] = []
         velocities = torch.zeros(count, components, (history - 1) * 3, device=device)
         velocity = torch.zeros(count, components, 3, device=device)
         body_velocity = torch.zeros(count, components, 3, device=device)
@@ -121,8 +133,15 @@ class SampleBuilder:
         start, next_start = 0, 0
         for b, (s, t) in enumerate(picks):
             sequence, rng = self.sequences[s], streams[b]
-            subset = np.sort(rng.permutation(len(sequence.faces))[:faces])
-            weights[b] = sequence.weights(subset, scale[b])
+            if whole_garments:
+                subset = np.arange(faces)
+                subset[sizes[b] :] = 0
+            else:
+                subset = np.sort(rng.permutation(len(sequence.faces))[:faces])
+            if self.patches:
+                shown.append(sequence.patches if whole_garments else sequence.patches.subset(subset))
+            if weights is not None:
+                weights[b] = sequence.weights(subset, scale[b])
             subset = self._send(subset)
             frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
             past = sequence.vertices[frames]
@@ -183,7 +202,14 @@ class SampleBuilder:
             mask = self._send(np.arange(components)[None] < np.array(real)[:, None])
         share = torch.full((), sum(whole) * count / len(whole), device=device)
         ids = [(self.sequences[s].name, t) for s, t in picks]
-        return Batch(features, velocities, weights, mask, share, target, ids)
+        if weights is not None:
+            return Batch(features, velocities, weights, mask, share, target, ids)
+        layout = patch_layout(shown, self.network.geodesic_radius, self.network.geodesic_power, device, scale)
+        face_mask = None
+        if min(sizes) < faces:
+            face_mask = self._send(np.arange(faces)[None] < np.array(sizes)[:, None])
+        total = torch.full((), all_faces * count / len(whole), device=device)
+        return Batch(features, velocities, layout, mask, share, target, ids, face_mask, total)
 
     def _drawn(
         self, picks: list[tuple[int, int]], streams: list[np.random.Generator]

@@ -13,6 +13,7 @@ from warpgarment.garment import Garment
 from warpgarment.heading import yaw
 from warpgarment.kernels.deformation import deformation_gradient_from_inverse, inverse_rest_frames
 from warpgarment.kernels.laplacian import components
+from warpgarment.patches import Patches, garment_patches, patches
 from warpgarment.pooled_weights import dense_weights
 from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached
 from warpgarment.training.noise import NoiseBasis
@@ -71,7 +72,8 @@ class SequenceData:
     def garment(self) -> Garment:
         """The garment, with the cached geodesics, for unrolled samples."""
         garment = self.source.garment
-        garment.__dict__.setdefault("geodesics", _writable(self._geodesics))
+        if self._geodesics is not None:
+            garment.__dict__.setdefault("geodesics", _writable(self._geodesics))
         return garment
 
     def body_frames(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -85,6 +87,14 @@ class SequenceData:
         faces = self.source.body_in([0]).faces[self.source.collider_faces]
         used, inverse = np.unique(faces, return_inverse=True)
         return used, inverse.reshape(-1, 3)
+
+    @cached_property
+    def patches(self) -> Patches:
+        """The garment's patches, for a network that has them."""
+        garment, distances = self.source.garment, self._geodesics
+        if distances is None:
+            return garment_patches(garment, self._network.patch_spacing)
+        return patches(garment.vertices, garment.faces, self._network.patch_spacing, lambda face: distances[face])
 
     @property
     def count(self) -> int:

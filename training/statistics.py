@@ -7,13 +7,13 @@ from collections.abc import Iterable
 import torch
 
 from warpgarment.kernels.features import FEATURES
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.network import GarmentNetwork
 from warpgarment.training.samples import Batch
 
 FLOORS = {"feature": 3e-3, "velocity": 1e-3, "psi": 1e-3, "singular_value": 1e-3, "q": 3e-4}
 
 
-def statistics(batches: Iterable[Batch], network: ManifoldAwareTransformer) -> dict[str, torch.Tensor]:
+def statistics(batches: Iterable[Batch], network: GarmentNetwork) -> dict[str, torch.Tensor]:
     """Means and standard deviations of inputs and targets over some batches.
 
     Residual outputs keep the means that stand for skin; deviations have floors, so that numbers which hardly vary (a
@@ -21,11 +21,12 @@ def statistics(batches: Iterable[Batch], network: ManifoldAwareTransformer) -> d
     """
     samples: dict[str, list[torch.Tensor]] = {name: [] for name in FLOORS}
     for batch in batches:
-        samples["feature"].append(batch.features.reshape(-1, FEATURES))
+        faces = slice(None) if batch.face_mask is None else batch.face_mask
+        samples["feature"].append(batch.features[faces].reshape(-1, FEATURES))
         real = slice(None) if batch.velocity_mask is None else batch.velocity_mask
         samples["velocity"].append(batch.velocities[real].reshape(-1, 3))
-        samples["psi"].append(batch.target.psi.reshape(-1, 9))
-        samples["singular_value"].append(batch.target.singular_values.reshape(-1, 3))
+        samples["psi"].append(batch.target.psi[faces].reshape(-1, 9))
+        samples["singular_value"].append(batch.target.singular_values[faces].reshape(-1, 3))
         samples["q"].append(batch.target.velocity[real].reshape(-1, 3))
     found = {}
     for name, parts in samples.items():

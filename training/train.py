@@ -25,7 +25,7 @@ import torch
 
 from warpgarment import checkpoint
 from warpgarment.io.atomic import atomic_file
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.network import ManifoldAwareTransformer, PatchTransformer, build_network
 from warpgarment.training.distributed import Group, GroupError
 from warpgarment.training.grow import grow
 from warpgarment.training.loader import Plan
@@ -66,10 +66,13 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     torch.manual_seed(config.seed)
     if config.init is not None:
         network = checkpoint.load(checkpoint.find(config.init), device=group.device)
+        wanted = config.network_config()
         if config.grow:
-            network = grow(network, config.network_config())
+            network = grow(network, wanted)
+        elif isinstance(network, ManifoldAwareTransformer) and wanted.architecture == "patches":
+            network = PatchTransformer.from_faces(network, wanted).to(group.device)
     else:
-        network = ManifoldAwareTransformer(config.network_config()).to(group.device)
+        network = build_network(config.network_config()).to(group.device)
     skipped: dict[str, str] = {}
     try:
         sequences = load_sequences(config, network.config, skipped, group)

@@ -22,10 +22,11 @@ class TrainConfig:
     Attributes:
         data: Folder of sequences.
         out: Folder for everything that is written.
-        network: Shape to start from.
+        network: Shape to start from; "fast" is a network of patches, see patch_network.py.
         overrides: Changes to it, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
         init: Checkpoint to start from instead of random weights (its shape and statistics are kept): a file, a folder,
-            or the name of a network that ships.
+            or the name of a network that ships. A network of patches may start from one of faces: see
+            `PatchTransformer.from_faces`.
         grow: First grow `init` to the shape of `network` and `overrides`, without a change of what it predicts.
         steps: Number of steps; None: as many as `time_limit` allows.
         time_limit: Minutes after which the run stops cleanly, everything counted; None: no limit.
@@ -57,7 +58,7 @@ class TrainConfig:
 
     data: Path
     out: Path
-    network: Literal["small", "base"] = "small"
+    network: Literal["small", "base", "fast"] = "small"
     overrides: tuple[str, ...] = ("dropout=0.0",)
     init: Path | None = None
     grow: bool = False

@@ -17,6 +17,7 @@ from warpgarment.garment import Garment
 from warpgarment.kernels.laplacian import components
 from warpgarment.network import NetworkConfig, geodesic_weights
 from warpgarment.parametrisation import NetworkOutput
+from warpgarment.patches import PatchLayout, garment_patches, patch_layout
 from warpgarment.pooled_geodesics import CENTRES
 from warpgarment.pooled_weights import PooledWeights, pooled_weights
 
@@ -132,7 +133,8 @@ class PaddedView:
     face_mask: torch.Tensor | None  # bool [R,N]; None where nothing is padded
     component_index: torch.Tensor  # int64 [R,C], into the packed components; 0 where padded
     component_mask: torch.Tensor | None  # bool [R,C]
-    weights: torch.Tensor | PooledWeights  # geodesic weights, [R,N,N] or [1,N,N]; pooled for large garments
+    # geodesic weights, [R,N,N] or [1,N,N], pooled for large garments; or patches, of R rows or one:
+    weights: torch.Tensor | PooledWeights | PatchLayout
     share: torch.Tensor  # [R], one over the number of rows of the same garment
     real_faces: torch.Tensor | None  # int64, where face_mask is True in rows end to end; None where all are
     real_components: torch.Tensor | None  # the same of component_mask
@@ -168,23 +170,32 @@ def padded_views(
         garments: The same garments, for their geodesic distances.
         config: Of the network.
         face_splits: Disjoint subsets of faces per garment, each seen by the network alone: faces s, s+n, s+2n, ...
-            Attention costs n times less, and a face no longer hears all others.
+            Attention costs n times less, and a face no longer hears all others. A network of patches sees whole
+            garments always.
     """
-    groups = row_groups([len(garment.faces) for garment in garments], face_splits)
+    if config.architecture == "patches":
+        face_splits = 1
+    groups = row_groups(garments, config, face_splits)
     return [_view(packed, garments, config, face_splits, group) for group in groups]
 
 
-def row_groups(face_counts: Sequence[int], face_splits: int) -> list[list[tuple[int, int, int]]]:
+def row_groups(
+    garments: Sequence[Garment], config: NetworkConfig, face_splits: int
+) -> list[list[tuple[int, int, int]]]:
     """Which rows share a view, the longest first; each row is a garment's number, its first face, and how many faces.
 
     Args:
-        face_counts: Faces of each garment.
+        garments: In the order of the batch.
+        config: Of the network.
         face_splits: As `padded_views`.
     """
     if face_splits < 1:
         raise ValueError(f"face_splits must be at least 1, got {face_splits}")
+    if config.architecture == "patches":
+        face_splits = 1
     rows = []
-    for number, faces in enumerate(face_counts):
+    for number, garment in enumerate(garments):
+        faces = len(garment.faces)
         rows += [(number, s, len(range(s, faces, face_splits))) for s in range(min(face_splits, faces))]
     rows.sort(key=lambda row: -row[2])
 
@@ -192,10 +203,14 @@ def row_groups(face_counts: Sequence[int], face_splits: int) -> list[list[tuple[
     for row in rows:
         if groups:
             longest, together = groups[-1][0][2], len(groups[-1]) + 1
-            pooled = garments[row[0]].pools
-            entries = CENTRES**2 if pooled else longest**2
-            fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
-            if fits and pooled == garments[groups[-1][0][0]].pools and longest <= PADDING * row[2]:
+            if config.architecture == "patches":
+                fits, alike = together * longest <= TOKENS_PER_VIEW, True
+            else:
+                pooled = garments[row[0]].pools
+                entries = CENTRES**2 if pooled else longest**2
+                fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
+                alike = pooled == garments[groups[-1][0][0]].pools
+            if fits and alike and longest <= PADDING * row[2]:
                 groups[-1].append(row)
                 continue
         groups.append([row])
@@ -210,7 +225,6 @@ def _view(
     rows: Sequence[tuple[int, int, int]],
 ) -> PaddedView:
     device = packed.faces.device
-    weights: torch.Tensor | PooledWeights
     faces = max(row[2] for row in rows)
     width = max(packed.component_offsets[g + 1] - packed.component_offsets[g] for g, _, _ in rows)
     face_index = np.full((len(rows), faces), -1)
@@ -220,20 +234,24 @@ def _view(
         mine = range(packed.component_offsets[g], packed.component_offsets[g + 1])
         component_index[r, : len(mine)] = mine
 
-    if not config.manifold_heads:
+    weights: torch.Tensor | PooledWeights | PatchLayout
+    shared = len({(id(garments[g]), first) for g, first, _ in rows}) == 1
+    if config.architecture == "patches":
+        shown = [garment_patches(garments[g], config.patch_spacing) for g, _, _ in (rows[:1] if shared else rows)]
+        weights = patch_layout(shown, config.geodesic_radius, config.geodesic_power, device)
+    elif not config.manifold_heads:
         weights = torch.zeros((1, 0, 0), device=device)
     elif garments[rows[0][0]].pools:
-        same = len({(id(garments[g]), first) for g, first, _ in rows}) == 1
         weights = pooled_weights(
             [
                 (garments[g].pooled_geodesics, np.arange(first, len(garments[g].faces), face_splits))
-                for g, first, _ in (rows[:1] if same else rows)
+                for g, first, _ in (rows[:1] if shared else rows)
             ],
             config.geodesic_radius,
             config.geodesic_power,
             device,
         )
-    elif len({(id(garments[g]), first) for g, first, _ in rows}) == 1:
+    elif shared:
         weights = _weights(garments[rows[0][0]], rows[0][1], face_splits, config, device)[None]
     else:
         weights = torch.zeros((len(rows), faces, faces), device=device)

@@ -20,17 +20,24 @@ from safetensors.torch import save as serialise
 from warpgarment import hub, shards
 from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
-from warpgarment.network import STATISTICS, ManifoldAwareTransformer, NetworkConfig
+from warpgarment.network import STATISTICS, GarmentNetwork, NetworkConfig, build_network
 
 FORMAT = "warpgarment.network"
 FORMAT_VERSION = 1
 WEIGHTS = Path(__file__).parent / "assets" / "weights"  # networks that ship with the package
-LATER = {"replace_singular_values"}  # settings that older checkpoints do not have: their default is how it was then
+LATER = {  # settings that older checkpoints do not have: their default is how it was then
+    "replace_singular_values",
+    "architecture",
+    "patch_spacing",
+    "face_embedding",
+    "face_feed_forward",
+    "face_layers",
+}
 _DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 
 def save(
-    network: ManifoldAwareTransformer,
+    network: GarmentNetwork,
     path: str | os.PathLike[str],
     *,
     dtype: torch.dtype | None = None,
@@ -73,7 +80,7 @@ def save(
         temporary.write_bytes(serialise(tensors, metadata=metadata))
 
 
-def load(path: str | os.PathLike[str], *, device: torch.device | str | None = None) -> ManifoldAwareTransformer:
+def load(path: str | os.PathLike[str], *, device: torch.device | str | None = None) -> GarmentNetwork:
     """Reads a checkpoint.
 
     Args:
@@ -81,7 +88,7 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
         device: Where the network goes; the CPU unless said otherwise.
 
     Returns:
-        The network in float32 and in evaluation mode.
+        The network, of the kind its config says, in float32 and in evaluation mode.
 
     Raises:
         CheckpointError: No file, a truncated or foreign one, shards that do not belong together, or settings or tensors
@@ -90,7 +97,7 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
     contents = shards.contents(path)
     path = contents.path
     config, _ = _described(contents)
-    network = ManifoldAwareTransformer(config)
+    network = build_network(config)
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     _check_tensors(path, expected, contents.shapes)
     tensors = contents.tensors()

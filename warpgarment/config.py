@@ -28,9 +28,14 @@ class NetworkConfig:
     norm_first: bool = False
     activation: str = "relu"  # or "gelu"
     fps: float = 30.0  # of the motions it was trained on
+    architecture: str = "faces"  # every face a token; or "patches", see patch_network.py, to which alone belong:
+    patch_spacing: float = 0.08  # metres between patches; `embedding` and `feed_forward` are those of their tokens
+    face_embedding: int = 128
+    face_feed_forward: int = 128
+    face_layers: int = 2  # after the patches have been heard; one more goes before
 
     def __post_init__(self) -> None:
-        for name in ("embedding", "layers", "feed_forward", "heads"):
+        for name in ("embedding", "layers", "feed_forward", "heads", "face_embedding", "face_feed_forward"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.embedding % self.heads:
@@ -41,11 +46,15 @@ class NetworkConfig:
             raise ValueError(f"history must be at least 2 frames, since velocities need two, got {self.history}")
         if not 0.0 <= self.dropout < 1.0:
             raise ValueError(f"dropout must lie in [0, 1), got {self.dropout}")
-        for name in ("geodesic_power", "geodesic_radius", "fps"):
+        if self.face_layers < 0:
+            raise ValueError(f"face_layers must not be negative, got {self.face_layers}")
+        for name in ("geodesic_power", "geodesic_radius", "fps", "patch_spacing"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
         if self.heading not in ("world", "canonical"):
             raise ValueError(f'heading must be "world" or "canonical", got {self.heading!r}')
+        if self.architecture not in ("faces", "patches"):
+            raise ValueError(f'architecture must be "faces" or "patches", got {self.architecture!r}')
         if self.activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
 
@@ -63,6 +72,26 @@ class NetworkConfig:
             "feed_forward": 192,
             "heads": 4,
             "manifold_heads": 2,
+            "geodesic_power": 2.0,
+            "geodesic_radius": 0.15,
+            "residual": True,
+            "heading": "canonical",
+            "norm_first": True,
+            "activation": "gelu",
+        }
+        return cls(**(settings | changes))
+
+    @classmethod
+    def fast(cls, **changes: Any) -> NetworkConfig:
+        """A network of patches for real time on one CPU core."""
+        settings: dict[str, Any] = {
+            "architecture": "patches",
+            "embedding": 128,
+            "layers": 4,
+            "feed_forward": 192,
+            "heads": 4,
+            "manifold_heads": 2,
+            "dropout": 0.0,
             "geodesic_power": 2.0,
             "geodesic_radius": 0.15,
             "residual": True,

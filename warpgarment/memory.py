@@ -24,9 +24,11 @@ from warpgarment.errors import NotEnoughMemory
 from warpgarment.garment import Garment
 from warpgarment.kernels import compliance
 from warpgarment.kernels.features import FEATURES
+from warpgarment.pooled_geodesics import CENTRES, NEAR
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes: rest frames, indices; sparse matrices and vectors of the solvers
+PER_PATCHED_FACE = 120  # bytes: the patches of a face with its shares in them, its neighbours
 PER_BODY_FACE, PER_BODY_VERTEX = 400, 60  # bytes: search tree with winding numbers; positions of two frames
 GRAPHED = 3  # copies of the history on a GPU: that of a state, and what a graph reads and writes
 MAKING_WEIGHTS = 2.3  # matrices besides the result while geodesic weights are made
@@ -83,16 +85,22 @@ def predict(
         body_vertices = sum(b.vertices.shape[1] for b in bodies)
         body_faces = sum(len(b.faces) for b in bodies)
 
-    groups = row_groups([len(garment.faces) for garment in garments], face_splits)
+    groups = row_groups(garments, config, face_splits)
+    patches = config.architecture == "patches"
+    width = config.face_embedding if patches else config.embedding
+    hidden = config.face_feed_forward if patches else config.feed_forward
     weights, largest, network = 0, 0, 0
     stack = 4 * config.history * FEATURES
     for group in groups:
         length = max(count for _, _, count in group)
         shared = len({(id(garments[g]), first) for g, first, _ in group}) == 1
-        matrices = length**2 * (1 if shared else len(group)) if config.manifold_heads else 0
-        weights, largest = weights + 4 * matrices, max(largest, 4 * length**2 if matrices else 0)
-        inside = STACKS[1] * stack + (2 * (TOKENS + 1.5) if half else 4 * TOKENS) * config.embedding
-        inside += 4 * max(0, 2 * config.feed_forward - 3 * config.embedding)
+        rows = 1 if shared else len(group)
+        each = 0 if patches or not config.manifold_heads else _weights(garments[group[0][0]], length)
+        matrices = rows * each
+        weights += 4 * matrices + (rows * length * PER_PATCHED_FACE if patches else 0)
+        largest = max(largest, 4 * each)
+        inside = STACKS[1] * stack + (2 * (TOKENS + 1.5) if half else 4 * TOKENS) * width
+        inside += 4 * max(0, 2 * hidden - 3 * width)
         activations = len(group) * length * max(STACKS[0] * stack, inside)
         network = max(network, int(activations) + (2 * matrices if half else 0))
 
@@ -107,7 +115,9 @@ def predict(
     return Memory(
         {
             "geodesic weights": weights,
-            "geodesic distances": sum(4 * len(g.faces) ** 2 for g in unique) if cpu and config.manifold_heads else 0,
+            "geodesic distances": sum(4 * _weights(g, len(g.faces)) for g in unique)
+            if cpu and config.manifold_heads and not patches
+            else 0,
             "compliance of collisions": blocks,
             "history of features": (1 if cpu else GRAPHED) * stack * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
@@ -169,6 +179,11 @@ def check(
         f"{len(garments):,} garments need {needed}. That is more than {_size(limit)}, {USABLE:.0%} of what is free on "
         f"{device}. {remedy}"
     )
+
+
+def _weights(garment: Garment, faces: int) -> int:
+    """Entries of the geodesic weights of so many faces of a garment: of each pair, or between the centres of pools."""
+    return CENTRES**2 + 2 * NEAR * faces if garment.pools else faces**2
 
 
 def _compliance(garments: Sequence[Garment]) -> tuple[int, int, int]:

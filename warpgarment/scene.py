@@ -24,7 +24,7 @@ from warpgarment.kernels.frame_features import frame_features
 from warpgarment.kernels.next_gradients import next_gradients
 from warpgarment.kernels.poisson import PoissonSolver
 from warpgarment.kernels.sdf import BodyMeshes
-from warpgarment.network import ManifoldAwareTransformer, NetworkOutput
+from warpgarment.network import GarmentNetwork, NetworkOutput
 from warpgarment.parametrisation import Step, compose, context
 from warpgarment.pins import BodyPins, mean_response
 from warpgarment.timing import Timings
@@ -64,7 +64,7 @@ class Scene:
         bodies: PackedBodies,
         body_vertices: torch.Tensor,
         first_vertices: torch.Tensor,
-        network: ManifoldAwareTransformer,
+        network: GarmentNetwork,
         *,
         face_splits: int,
         epsilon: float | None,

@@ -25,7 +25,7 @@ from warpgarment.frame_graph import GraphedFrames
 from warpgarment.garment import Garment
 from warpgarment.history import History
 from warpgarment.motion import GarmentMotion
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.network import GarmentNetwork
 from warpgarment.scene import Scene
 from warpgarment.state import SimulationState
 from warpgarment.timing import Timings
@@ -52,7 +52,7 @@ class Simulator:
 
     def __init__(
         self,
-        network: ManifoldAwareTransformer,
+        network: GarmentNetwork,
         device: torch.device | str | None = None,
         *,
         epsilon: float | None = None,
