@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from warpgarment import checkpoint
 from warpgarment.metrics import mean_vertex_error
-from warpgarment.patches import PatchLayout
 from warpgarment.training import state as training_state
 from warpgarment.training.distributed import Group
 from warpgarment.training.loader import Loader, Plan
