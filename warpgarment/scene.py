@@ -189,12 +189,16 @@ class Scene:
         """
         packed = self.packed
         with self.timings("singular values"):
-            options = {"replace": self.network.config.replace_singular_values, "smallest": SMALLEST_SINGULAR_VALUE}
+            replace = self.network.config.replace_singular_values
             if step.psi.requires_grad or features.requires_grad:
-                target, finite = differentiable.next_gradients(packed, features, step, **options)
+                target, finite = differentiable.next_gradients(
+                    packed, features, step, replace=replace, smallest=SMALLEST_SINGULAR_VALUE
+                )
             else:
                 owners = (packed.face_component, packed.garment_of_face, packed.count)
-                target, finite = next_gradients(features, *step, *owners, **options)
+                target, finite = next_gradients(
+                    features, *step, *owners, replace=replace, smallest=SMALLEST_SINGULAR_VALUE
+                )
         with self.timings("poisson"):
             velocity = torch.nan_to_num(step.velocity, 0.0, 0.0, 0.0)
             mean = self.components_mean(vertices) + velocity
