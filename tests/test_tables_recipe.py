@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from warpgarment.training.evaluate import EvaluateConfig, evaluate
 from warpgarment.training.tables import compare, recipe, report, runs, settings, variants
 from warpgarment.training.tables.options import TableOptions
 from warpgarment.training.train import NonFiniteLoss, TrainConfig
+from warpgarment.training.unroll import UnrollConfig
 
 SHAPE = ("dropout=0.0", "embedding=16", "layers=1", "feed_forward=16", "heads=2", "manifold_heads=1")
 QUICK = (
@@ -134,6 +137,20 @@ def test_the_table_says_what_changed_and_what_it_did(made):
     assert (config.out / "recipe.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert report.command(config).endswith("--rows as_given paper lr_third lr_triple --steps 3 --overrides "
                                            + " ".join(SHAPE) + " --settings " + " ".join(QUICK))  # fmt: skip
+
+
+def test_rows_from_before_a_setting_came_are_used_again(made, data, tmp_path):
+    """A new setting of the training would make every row trained before it useless, though it has its default there;
+    with another value the row is still refused."""
+    root, config, _ = made
+    shutil.copytree(root / "runs/recipe/lr_third", tmp_path / "row")
+    record = json.loads((tmp_path / "row/row.json").read_text())
+    record["settings"] = {k: v for k, v in record["settings"].items() if not k.startswith("unroll.")}
+    (tmp_path / "row/row.json").write_text(json.dumps(record))
+    training = compare.plan(config)[0]["lr_third"]
+    assert runs.trained(tmp_path / "row", training, runs.identity(data)).steps == 3
+    with pytest.raises(runs.RunMismatch, match=r"unroll\.steps was 1, is 2"):
+        runs.trained(tmp_path / "row", replace(training, unroll=UnrollConfig(steps=2)), runs.identity(data))
 
 
 def rows_with(errors: dict[str, list[tuple[float, float]]]) -> list[dict]:
