@@ -15,6 +15,7 @@ import torch
 from warpgarment.batch import PackedBodies, PackedGarments, padded_views
 from warpgarment.errors import MeshError
 from warpgarment.garment import Garment
+from warpgarment.kernels.body_meshes import BodyQuery
 from warpgarment.kernels.collision import CollisionSolver
 from warpgarment.kernels.deformation import face_centroids, inverse_rest_frames, replace_singular_values, segment_mean
 from warpgarment.kernels.features import LAYOUT, BodyInteraction, body_interaction, face_features
@@ -208,7 +209,9 @@ class Scene:
         """
         with self.timings("collision"):
             bodies = self.bodies(next_body)
-            pending, depth, found, iterations = finite.clone(), None, None, 0
+            pending, iterations = finite.clone(), 0
+            depth: torch.Tensor | None = None
+            found: BodyQuery | None = None
             for _ in range(self.collision_passes):
                 refined = self.collision.refine(
                     vertices, bodies, self.body_of_vertex, epsilon=self.epsilon, found=found
