@@ -35,7 +35,9 @@ The residual is a bound, and the error in the energy norm a small part of it. Me
 Parts = tuple[cg.System, Compliance, Factor, torch.Tensor, bool]
 
 
-def model_of(system: cg.System, dense: Compliance, factor: Factor, vertex_component: torch.Tensor, one_core: bool):
+def model_of(
+    system: cg.System, dense: Compliance, factor: Factor, vertex_component: torch.Tensor, one_core: bool
+) -> list[torch.Tensor]:
     """The tensors of a solver, which travel through the operators as one list."""
     return [*system, *dense, *factor, vertex_component, torch.tensor(one_core)]
 
@@ -64,11 +66,12 @@ def _solve(
     system, dense, factor, vertex_component, one_core = parts
     count, device = len(tolerance), normal.device
     force = torch.zeros(len(normal), dtype=torch.float64, device=device)
-    by_forces = (dense.base >= 0) | (factor.base >= 0)
     inverted, factored = int(dense.sizes[1]), int(factor.counts[0])
     if inverted + factored < count:
         right = normal * gap[:, None] if load is None else load
-        right = right * (~by_forces)[vertex_component.long(), None] if inverted + factored else right
+        if inverted + factored:  # the others' loads are zero, which takes no iterations
+            left = (dense.base < 0) & (factor.base < 0)
+            right = right * left[vertex_component.long(), None]
         increment, report, error = cg.solve(system, normal, right, tolerance, relative, max_iterations)
         force += (normal * increment).sum(1) if load is not None else 0.0
     else:

@@ -43,7 +43,8 @@ class RolloutStatus:
         frame: Index in the motion, from 0.
         finite: Whether every position is finite.
         max_penetration: Depth of the deepest vertex below the body's surface [m], at least 0.
-        poisson_iterations: Conjugate gradient iterations of the Poisson solve, the largest of all components.
+        poisson_iterations: Conjugate gradient iterations of the Poisson solve, the largest of all components; 0 where
+            it was solved directly.
         collision_iterations: The same of the collision refinement.
         verdict: What follows from these.
     """
