@@ -31,11 +31,12 @@ from .measure import RESULTS, Row, machine
 PARTS = ("stages", "batch", "roofline", "teacher", "profile")
 FACES = (500, 1000, 2000, 5000, 10000)
 QUICK = (500, 2000)
+SECONDS = {False: 0.5, True: 0.15}  # spent on each call that is timed, by --quick
 
 
 def measured(options: argparse.Namespace, device: torch.device) -> Iterator[Row]:
     """All rows of the parts that were asked for."""
-    seconds = 0.15 if options.quick else 0.5
+    seconds = SECONDS[options.quick]
     if "stages" in options.only:
         yield from itertools.chain.from_iterable(stages.rows(n, device, seconds) for n in options.faces)
     if "batch" in options.only:
@@ -44,7 +45,7 @@ def measured(options: argparse.Namespace, device: torch.device) -> Iterator[Row]
         sizes = options.faces if options.quick or device.type == "cuda" else options.faces[:4]
         yield from roofline.rows(sizes, options.batch[:: len(options.batch) - 1 or 1], device, options.weights, seconds)
     if "teacher" in options.only:
-        yield from teacher.against(options.faces[:2], device, options.weights, 3 if options.quick else 6)
+        yield from teacher.against(options.faces[:2], device, options.weights, 2 if options.quick else 6)
     if "profile" in options.only:
         yield from frames.rows(options.faces[0], (1, 2, 8), device, options.weights)
 

@@ -29,7 +29,9 @@ class Times(list[float]):
         self.wall: list[float] = []
 
 
-def interleaved(calls: dict[str, Call], device: torch.device, seconds: float, least: int = 3) -> dict[str, Times]:
+def interleaved(
+    calls: dict[str, Call], device: torch.device, seconds: float, least: int = 3, most: int = 200
+) -> dict[str, Times]:
     """Times of calls that take turns, so that what else the machine does disturbs all of them [ms].
 
     On a CPU the processor's time is taken, all threads together: what a call costs on one core, whoever else is there.
@@ -38,7 +40,8 @@ def interleaved(calls: dict[str, Call], device: torch.device, seconds: float, le
         calls: By name. Each runs once before, unless that alone took `seconds`.
         device: Waited for around every call.
         seconds: Rounds are begun until so much time has passed for each call,
-        least: but at least so many, and at most 200.
+        least: but at least so many, unless that takes four times as long,
+        most: and at most so many.
     """
 
     spent = {name: Times() for name in calls}
@@ -60,7 +63,7 @@ def interleaved(calls: dict[str, Call], device: torch.device, seconds: float, le
             spent[name].clear()
             spent[name].wall.clear()
     began, rounds = time.perf_counter(), 0
-    while rounds < 200 and (rounds < least or time.perf_counter() - began < seconds * len(calls)):
+    while rounds < most and (rounds < least or time.perf_counter() - began < seconds * len(calls)):
         for name in calls:
             take(name)
         rounds += 1
