@@ -237,7 +237,7 @@ def test_plans_that_cannot_be_are_refused(data, tmp_path):
     ):
         with pytest.raises(OptionMissing, match=message):
             compare.plan(table_config(data, tmp_path, **change))
-    with pytest.raises(OptionMissing, match="small or base"):
+    with pytest.raises(OptionMissing, match="small, base, fast"):
         compare.plan(dataclasses.replace(table_config(data, tmp_path), network="elsewhere.safetensors"))
     with pytest.raises(variants.RowError, match="no rows power_7"):
         compare.plan(table_config(data, tmp_path, rows=("power_7",)))

@@ -55,7 +55,7 @@ class EvaluateConfig:
         data: Folder of sequences.
         out: Folder for the results; those of tables go to benchmarks/results by default.
         network: Checkpoint file or folder, or the name of a network that ships. table1, table2 and recipe train
-            networks of their own: small or base, the shape to start from ("default" is small).
+            networks of their own: small, base or fast, the shape to start from ("default" is small).
         split: Which sequences.
         frames: Most frames predicted per sequence; None: all there are.
         geodesic_frames: Frames per rollout at which geodesic distortion is sampled, evenly spaced.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -95,7 +95,7 @@ def _training(notes: Mapping[str, Any], log: Sequence[Mapping[str, Any]]) -> lis
     rows = [[key, _plainly(value)] for key, value in notes.items() if key not in ("training", "data")]
     lines = table(["budget", "value"], rows) if rows else ["The checkpoint has no notes.", ""]
     if isinstance(settings, Mapping):
-        lines += ["Settings: " + ", ".join(f"{key} {_plainly(value)}" for key, value in settings.items()) + ".", ""]
+        lines += ["Settings: " + ", ".join(f"{key} {_plainly(value)}" for key, value in _flat(settings)) + ".", ""]
     if log:
         lines += ["![Training loss and validation error](card/training.png)", ""]
         best = [line for line in log if isinstance(line.get("rollout_error_cm"), (int, float))]
@@ -182,5 +182,16 @@ def _mean(values: Iterable[float | None]) -> str:
     return f"{shown} ({failed} failed)" if failed else shown
 
 
+def _flat(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings of groups as group.name."""
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield before + key, value
+
+
 def _plainly(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
     return value if isinstance(value, str) else json.dumps(value, default=str)

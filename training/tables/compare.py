@@ -19,6 +19,7 @@ from .report import BASELINES, PROTOCOL, means_table, publish
 from .runs import identity, trained
 from .settings import with_settings
 
+SHAPES = ("small", "base", "fast")
 TITLES = {
     "table1": "Table 1: what manifold heads and singular values are worth",
     "table2": "Table 2: power and radius of the geodesic attention",
@@ -106,9 +107,9 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
     if (options.steps is None) == (options.time_limit is None):
         raise OptionMissing(f"{config.table} trains networks: give their budget, --steps N or --time-limit MINUTES")
     shape = "small" if config.network == "default" else config.network
-    if shape not in ("small", "base"):
-        raise OptionMissing(f"{config.table} trains networks of its own; --network is their shape, small or base")
-    common = _common(config, cast(Literal["small", "base"], shape))
+    if shape not in SHAPES:
+        raise OptionMissing(f"{config.table} trains networks of its own; --network is their shape: {', '.join(SHAPES)}")
+    common = _common(config, cast(Literal["small", "base", "fast"], shape))
     variants.check_different({"all": common})  # says so if an override does not exist
     if config.table == "recipe":
         rows = recipe.recipe(common)
@@ -121,7 +122,7 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
     return configs, rows
 
 
-def _common(config: Any, shape: Literal["small", "base"]) -> TrainConfig:
+def _common(config: Any, shape: Literal["small", "base", "fast"]) -> TrainConfig:
     """The training that all rows start from."""
     options = config.tables
     common = TrainConfig(

@@ -7,6 +7,7 @@ refused, never trained over.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
@@ -68,6 +69,7 @@ def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
         if record.get("complete"):
             return _complete(folder, record, config)
     file = train(replace(config, out=folder, resume=True))
+    gc.collect()  # its sequences and loader refer to each other, and the next row loads its own
     if config.steps is not None:
         done = _notes(folder / "network.safetensors").get("steps")
         if done not in (None, config.steps):
