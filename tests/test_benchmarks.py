@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks import exact, roofline
+from benchmarks import exact, manifold, roofline
 from benchmarks.__main__ import SECONDS, main
 from benchmarks.measure import aimed_time, compared, interleaved
 from benchmarks.networks import named
@@ -29,7 +29,8 @@ EXPECTED = {  # part: what its rows must be about, and references beside them
         }
         | {"features of a frame, one launch", "features other than distance", "collisions, off the minimiser"}
         | {"Poisson solve", "Poisson solve, off the direct solution", "collisions, 4 passes"}
-        | {"manifold heads of a layer", "manifold heads of a layer, patches"},
+        | {"manifold heads of a layer", "manifold heads of a layer, patches", "manifold heads of a layer, pooled"}
+        | {f"weights of {name}, pooled at 4,096 centres, off the dense ones" for name in ("base", "small")},
         {"NumPy", "NumPy SVD", "libigl fast winding number", "building it anew", "in two launches", "dense softmax"}
         | {"SciPy splu prefactored", "CHOLMOD prefactored", "cholespy prefactored", "CHOLMOD every frame"}
         | {"SciPy splu every frame", "SciPy splu, symmetric, every frame"},
@@ -56,6 +57,7 @@ def test_each_part_writes_its_rows(part, tmp_path, monkeypatch):
     """A part would end without its files, lose a yardstick without a word, or leave a figure out."""
     monkeypatch.setitem(SECONDS, True, 0.01)
     monkeypatch.setitem(roofline.MATRIX, "cpu", 64)
+    monkeypatch.setattr(manifold, "POOLED_FROM", 100)
     monkeypatch.setitem(roofline.COPIED, "cpu", 2**16)
     options = ["--quick", "--faces", "150", "--batch", "1", "2", "--device", "cpu", "--network", "small", "fast"]
     main(["--only", part, *options, "--out", str(tmp_path)])
