@@ -5,18 +5,19 @@
     python -m benchmarks --only stages roofline
     python -m benchmarks --faces 1000 --batch 1 8      # other sizes and batches
 
-Parts: `stages` each kernel beside the published way; `batch` whole frames, packed and one by one; `roofline` the
-network beside the device's own rates; `teacher` whole frames beside Newton's VBD; `profile` launches and waits within a
-frame. A CPU is measured on one thread. Calls that are compared take turns. Results: benchmarks/results/<device>.json,
-.md and .png. Needs the extras `physics` and `train`.
+Parts: `geodesics` distances over the cloth; `stages` each kernel beside the published way; `batch` whole frames, packed
+and one by one; `roofline` the network beside the device's own rates; `teacher` whole frames beside Newton's VBD;
+`profile` launches and waits within a frame. A CPU is measured on one thread. Calls that are compared take turns. Frames
+are those of the networks `small` and `fast`, or of those that `--network` names. Results:
+benchmarks/results/<device>.json, .md and .png. Needs the extras `physics` and `train`.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
+import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -25,29 +26,33 @@ import torch
 
 from warpgarment.io.atomic import atomic_files
 
-from . import batch, frames, report, roofline, stages, teacher
+from . import batch, frames, manifold, report, roofline, stages, teacher
 from .measure import RESULTS, Row, machine
+from .networks import DEFAULT, named
 
-PARTS = ("stages", "batch", "roofline", "teacher", "profile")
+PARTS = ("geodesics", "stages", "batch", "roofline", "teacher", "profile")
 FACES = (500, 1000, 2000, 5000, 10000)
 QUICK = (500, 2000)
+GEODESICS = (1000, 2000, 5000)  # and without --quick 10000, which everything of that size needs
 SECONDS = {False: 0.5, True: 0.15}  # spent on each call that is timed, by --quick
 
 
 def measured(options: argparse.Namespace, device: torch.device) -> Iterator[Row]:
     """All rows of the parts that were asked for."""
-    seconds = SECONDS[options.quick]
+    seconds, networks = SECONDS[options.quick], named(options.network)
+    if "geodesics" in options.only:
+        yield from manifold.geodesics(options.geodesics)
     if "stages" in options.only:
-        yield from itertools.chain.from_iterable(stages.rows(n, device, seconds) for n in options.faces)
+        yield from stages.all_rows(options.faces, options.large, device, seconds)
     if "batch" in options.only:
-        yield from batch.rows(options.faces, options.batch, device, options.weights, seconds)
+        yield from batch.rows(options.faces, options.batch, device, networks, seconds)
     if "roofline" in options.only:
         sizes = options.faces if options.quick or device.type == "cuda" else options.faces[:4]
-        yield from roofline.rows(sizes, options.batch[:: len(options.batch) - 1 or 1], device, options.weights, seconds)
+        yield from roofline.rows(sizes, options.batch[:: len(options.batch) - 1 or 1], device, networks, seconds)
     if "teacher" in options.only:
-        yield from teacher.against(options.faces[:2], device, options.weights, 2 if options.quick else 6)
+        yield from teacher.against(options.faces[:2], device, networks, 2 if options.quick else 6)
     if "profile" in options.only:
-        yield from frames.rows(options.faces[0], (1, 2, 8), device, options.weights)
+        yield from frames.rows(options.faces[0], (1, 2, 8), device, networks)
 
 
 def shown(rows: Iterable[Row]) -> Iterator[Row]:
@@ -55,14 +60,23 @@ def shown(rows: Iterable[Row]) -> Iterator[Row]:
     began = time.perf_counter()
     for row in rows:
         where = " ".join(f"{row[key]:>6,} {key}" for key in ("faces", "batch") if key in row)
+        where += f" {row['network']}" if "network" in row else ""
         if "note" in row:
             said = f"{row.get('reference', '')} {row['note']}".strip()
         elif "median_ms" in row:
             said = f"{row.get('min_ms', row['median_ms']):10.2f} ms"
             said += f"   {row['ratio']:8.2f} x {row['reference']}" if "ratio" in row else ""
             said += f"   {row['achieved']:.0%} of the roofline" if "achieved" in row else ""
+        elif "reached" in row and "warp_launches" not in row:
+            said = ""
         else:
-            said = ", ".join(f"{k} {v:g}" for k, v in row.items() if isinstance(v, (int, float)) and k not in where)
+            said = ", ".join(
+                f"{k} {v:g}"
+                for k, v in row.items()
+                if isinstance(v, (int, float)) and k not in ("faces", "batch", "met")
+            )
+        if "target" in row:
+            said += f"   {'met' if row['met'] else 'MISSED'}: {row['target']} ({row['reached']})"
         print(f"{time.perf_counter() - began:6.0f} s  {where:<22} {row['what']:<36} {said}", flush=True)
         yield row
 
@@ -75,10 +89,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--batch", type=int, nargs="+", help="garments at once")
     parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--weights", default="default")
+    parser.add_argument(
+        "--network",
+        nargs="+",
+        default=list(DEFAULT),
+        metavar="NAME",
+        help="timed: networks that ship, files, or untrained small, fast or base; default: %(default)s",
+    )
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the results")
     options = parser.parse_args(arguments)
     device = torch.device(options.device)
+    options.geodesics = options.faces or [*GEODESICS, *([] if options.quick else [10_000])]
+    options.large = not options.faces and not options.quick
     options.faces = options.faces or list(QUICK if options.quick else FACES)
     everything = batch.CPU_BATCH if device.type == "cpu" else batch.GPU_BATCH
     options.batch = options.batch or list(everything[:3] if options.quick else everything)
@@ -87,9 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         torch.set_num_threads(1)
     began = time.perf_counter()
     rows = list(shown(measured(options, device)))
-    command = f"python -m benchmarks --device {device.type} --only {' '.join(options.only)}"
-    command += f" --faces {' '.join(map(str, options.faces))} --batch {' '.join(map(str, options.batch))}"
-    command += f" --weights {options.weights}{' --quick' if options.quick else ''}"
+    command = " ".join(["python -m benchmarks", *(sys.argv[1:] if arguments is None else arguments)])
     about = machine(device)
     target = options.out / device.type
     spent = round(time.perf_counter() - began)

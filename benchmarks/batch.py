@@ -15,7 +15,8 @@ from warpgarment.garment import Garment
 from warpgarment.simulator import Simulator
 from warpgarment.state import SimulationState
 
-from .measure import NO_GPU, Row, figures, interleaved
+from .measure import NO_GPU, Row, aimed_time, figures, interleaved
+from .networks import Named
 from .scenes import Dressed, dressed
 
 CPU_BATCH = (1, 2, 4, 8, 16)
@@ -23,7 +24,7 @@ GPU_BATCH = (1, 4, 16, 64, 256, 1024, 4096)
 LOOP = 16  # largest batch that is also simulated one by one
 START, STARTS = 40, 8  # frames of the walk at which bodies of a batch begin
 WALK = 12  # frames, there and back
-LONGEST = 12.0  # seconds that a frame may take, by the batch before it
+LONGEST = 6.0  # seconds that a frame may take, by the batch before it
 
 
 class Rolling:
@@ -60,15 +61,19 @@ def scenes_of(sizes: Sequence[int], number: int) -> list[Dressed]:
 
 
 def rows(
-    faces: Sequence[int], batches: Sequence[int], device: torch.device, weights: str, seconds: float
+    faces: Sequence[int], batches: Sequence[int], device: torch.device, networks: Sequence[Named], seconds: float
 ) -> Iterator[Row]:
     """Milliseconds per garment and frame: each size alone in a batch, then all sizes mixed, and frames by stage."""
-    simulator = Simulator.from_pretrained(weights, device=device)
-    for size in faces:
-        yield from _series([size], batches, simulator, seconds)
-        yield from _stages(size, simulator)
-    if len(faces) > 1:
-        yield from _series(list(faces[:3]), [b for b in batches if b > 1], simulator, seconds)
+    simulators = [(label, Simulator(network, device)) for label, network in networks]
+    mixed = [(list(faces[:3]), [b for b in batches if b > 1])] if len(faces) > 1 else []
+    for sizes, numbers in [([size], batches) for size in faces] + mixed:
+        for label, simulator in simulators:
+            for row in _series(sizes, numbers, simulator, seconds):
+                row = row | {"network": label}
+                named = row["batch"] == len(sizes) == 1 and 1_500 < row["faces"] < 2_500 and device.type == "cpu"
+                yield aimed_time(row, 33.0, 2_000) if named else row
+            if len(sizes) == 1:
+                yield from (row | {"network": label} for row in _stages(sizes[0], simulator))
     if device.type == "cpu":
         for number in GPU_BATCH:
             yield {"part": "batch", "what": "frame per garment", "device": "cuda", "batch": number, "note": NO_GPU}

@@ -16,7 +16,8 @@ from warpgarment.kernels import cg
 from warpgarment.simulator import Simulator
 
 from .batch import Rolling, scenes_of
-from .measure import NO_GPU, Row
+from .measure import NO_GPU, Row, aimed
+from .networks import Named
 
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero"}  # the host waits for these
 VIEWS = {"view", "unsqueeze", "expand", "slice", "select", "t", "transpose", "split", "split_with_sizes", "alias"}
@@ -88,9 +89,15 @@ class FrameCounts:
         return counted
 
 
-def rows(faces: int, batches: Sequence[int], device: torch.device, weights: str) -> Iterator[Row]:
+def rows(faces: int, batches: Sequence[int], device: torch.device, networks: Sequence[Named]) -> Iterator[Row]:
     """Counts per frame for each batch; on a GPU also what torch's profiler saw of frames with and without a graph."""
-    simulator = Simulator.from_pretrained(weights, device=device)
+    for named in networks:
+        for row in _rows(faces, batches, device, named):
+            yield row | {"network": named.label}
+
+
+def _rows(faces: int, batches: Sequence[int], device: torch.device, named: Named) -> Iterator[Row]:
+    simulator, alone = Simulator(named.network, device), 0
     for number in batches:
         scenes = scenes_of([faces], number)
         rolling = Rolling(simulator, scenes)
@@ -98,28 +105,32 @@ def rows(faces: int, batches: Sequence[int], device: torch.device, weights: str)
         bodies = simulator._positions([scene.body.vertices[2] for scene in scenes])
         found = FrameCounts(rolling.state.scene, rolling.state.now, bodies)
         refits = found.launches.pop("refit", 0)
-        yield {
+        launches, reads = sum(found.launches.values()), len(found.reads)
+        alone = alone or launches
+        row = {
             "part": "profile",
             "what": "one frame, counted",
             "faces": len(scenes[0].garment.faces),
             "batch": number,
-            "warp_launches": sum(found.launches.values()),
+            "warp_launches": launches,
             "torch_operators": sum(found.operators.values()),
             "refits": refits,
-            "host_reads": len(found.reads),
+            "host_reads": reads,
         }
+        reached = f"{reads} reads, {launches} launches"
+        yield aimed(row, f"no reads, {alone} launches as for {batches[0]}", reached, not reads and launches == alone)
     for graph in (False, True):
         base = {"part": "profile", "what": f"frames {'as a CUDA graph' if graph else 'without a graph'}, profiled"}
         if device.type != "cuda":
             yield base | {"note": NO_GPU}
             continue
         for number in batches:
-            yield base | {"batch": number} | _profiled(faces, number, device, weights, graph)
+            yield base | {"batch": number} | _profiled(faces, number, device, named, graph)
 
 
-def _profiled(faces: int, number: int, device: torch.device, weights: str, graph: bool) -> Row:
+def _profiled(faces: int, number: int, device: torch.device, named: Named, graph: bool) -> Row:
     """Calls of the CUDA runtime per frame, as the profiler saw them."""
-    rolling = Rolling(Simulator.from_pretrained(weights, device=device, graph=graph), scenes_of([faces], number))
+    rolling = Rolling(Simulator(named.network, device, graph=graph), scenes_of([faces], number))
     for _ in range(WARM_UP + 2):
         rolling()
     torch.cuda.synchronize(device)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 RESULTS = Path(__file__).parent / "results"
@@ -79,20 +80,51 @@ def figures(times: Times, share: float = 1.0) -> Row:
 
 
 def compared(
-    base: Row, ours: Call, references: dict[str, Call | str], device: torch.device, seconds: float
+    base: Row,
+    ours: Call | dict[str, Call],
+    references: dict[str, Call | str],
+    device: torch.device,
+    seconds: float,
 ) -> list[Row]:
-    """One row of ours, and one for each reference with the ratio of least times; a reference may be a note instead."""
+    """One row of ours, and one for each reference with the ratio of least times; a reference may be a note instead.
+
+    Several calls of ours, by the `what` of their rows, share the references.
+    """
+    mine = {str(base["what"]): ours} if callable(ours) else ours
     calls = {name: call for name, call in references.items() if callable(call)}
-    times = interleaved({"": ours, **calls}, device, seconds)
-    mine = base | figures(times[""])
-    rows = [] if calls else [mine]
-    for name, call in references.items():
-        if isinstance(call, str):
-            rows.append(base | {"reference": name, "note": call})
-            continue
-        theirs = {f"reference_{key}": value for key, value in figures(times[name]).items()}
-        rows.append(mine | {"reference": name} | theirs | {"ratio": theirs["reference_min_ms"] / mine["min_ms"]})
+    times = interleaved({f"ours: {what}": call for what, call in mine.items()} | calls, device, seconds)
+    rows = []
+    for what in mine:
+        row = base | {"what": what} | figures(times[f"ours: {what}"])
+        if not calls:
+            rows.append(row)
+        for name, call in references.items():
+            if isinstance(call, str):
+                rows.append(base | {"what": what, "reference": name, "note": call})
+                continue
+            theirs = {f"reference_{key}": value for key, value in figures(times[name]).items()}
+            rows.append(row | {"reference": name} | theirs | {"ratio": theirs["reference_min_ms"] / row["min_ms"]})
     return rows
+
+
+def aimed(row: Row, target: str, reached: str, met: bool) -> Row:
+    """A row with a target beside it, if it was measured."""
+    return row if "note" in row else row | {"target": target, "reached": reached, "met": bool(met)}
+
+
+def aimed_time(row: Row, limit: float, faces: int, power: float = 1.0) -> Row:
+    """A row whose median is to stay under a limit [ms], scaled by a power of the faces to the number that was named."""
+    if "note" in row:
+        return row
+    scaled = row["median_ms"] * (faces / row["faces"]) ** power
+    unit, factor = ("s", 1e-3) if limit >= 1e3 else ("ms", 1.0)
+    target = f"under {factor * limit:g} {unit} for {faces:,} faces"
+    return aimed(row, target, f"{factor * scaled:.3g} {unit}, scaled from {row['faces']:,} faces", scaled < limit)
+
+
+def tensor(array: np.ndarray, device: torch.device, dtype: type[np.generic] = np.float32) -> torch.Tensor:
+    """A copy of an array on the device."""
+    return torch.as_tensor(np.array(array, dtype=dtype, order="C"), device=device)
 
 
 def installed(package: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,14 +11,18 @@ import numpy as np
 from .measure import Row
 
 TITLES = {
+    "geodesics": "Distances over the cloth",
     "stages": "Stages against the published way",
     "batch": "Whole frames, per garment",
     "roofline": "The network against the device",
     "teacher": "Whole frames against the teacher",
     "profile": "Within a frame",
 }
+_TEXT = ("what", "network", "reference", "beside", "bound by", "target", "reached", "met")
 INTRODUCTIONS = {
-    "stages": "Ratio: least time of the reference over ours; references run on the CPU.",
+    "geodesics": "Between the centroids of all faces, of a garment that is seen for the first time.",
+    "stages": "Ratio: least time of the reference over ours; references run on the CPU. Off: distance at worst [mm] "
+    "from the exact answer in float64; references are given right-hand sides, contacts and matrices.",
     "batch": "Garments on bodies of their own. Ratio: a Python loop over the garments over the batch, in the same run.",
     "roofline": "Achieved: the least time that the measured rates allow, over the least time measured.",
     "teacher": "Ratio: least time of Newton's VBD over ours.",
@@ -32,6 +37,7 @@ def markdown(about: dict[str, str], command: str, rows: Sequence[Row]) -> str:
         "Milliseconds, least and median: of the processor on a CPU, all threads together; by the clock on a GPU.",
         "",
     ]
+    lines += _targets([row for row in rows if "target" in row])
     for part, title in TITLES.items():
         mine = [row for row in rows if row["part"] == part]
         if not mine:
@@ -42,31 +48,45 @@ def markdown(about: dict[str, str], command: str, rows: Sequence[Row]) -> str:
         elif part == "roofline":
             lines += _roofline(mine)
         else:
-            lines += _times(mine, part != "stages")
+            lines += _times([row for row in mine if "min_ms" in row or "median_ms" in row or "note" in row])
         lines.append("")
     return "\n".join(lines)
 
 
-def _times(rows: Sequence[Row], batches: bool) -> list[str]:
-    names = ["faces", *(["batch"] if batches else []), "what", "min", "median", "reference", "min", "median", "ratio"]
-    lines = _head(names, text=("what", "reference"))
+def _targets(rows: Sequence[Row]) -> list[str]:
+    if not rows:
+        return []
+    lines = ["## Targets", "", "Time targets hold for medians; ratios are of least times.", ""]
+    lines += _head(["faces", "batch", "what", "beside", "target", "reached", "met"], text=_TEXT)
     for row in rows:
-        cells = [_count(row, "faces"), *([_count(row, "batch")] if batches else []), row["what"]]
-        if "note" in row:
-            cells += [
-                "-",
-                "-",
-                f"{row['reference']}: {row['note']}" if "reference" in row else row["note"],
-                "-",
-                "-",
-                "-",
-            ]
-        else:
-            cells += [_ms(row, "min_ms"), _ms(row, "median_ms"), row.get("reference", "-")]
-            cells += [_ms(row, "reference_min_ms"), _ms(row, "reference_median_ms")]
-            cells.append(f"{row['ratio']:.2f}" if "ratio" in row else "-")
+        what = " ".join([row["what"], *([f"({row['network']})"] if "network" in row else [])])
+        cells = [_count(row, "faces"), _count(row, "batch"), what, row.get("reference", "-")]
+        cells += [row["target"], row["reached"], "yes" if row["met"] else "**no**"]
         lines.append("| " + " | ".join(cells) + " |")
-    return lines
+    return [*lines, ""]
+
+
+def _times(rows: Sequence[Row]) -> list[str]:
+    """Columns that no row has are left out."""
+    columns = {
+        "faces": lambda row: _count(row, "faces"),
+        "batch": lambda row: _count(row, "batch"),
+        "network": lambda row: row.get("network", "-"),
+        "what": lambda row: row["what"],
+        "min": lambda row: _ms(row, "min_ms"),
+        "median": lambda row: _ms(row, "median_ms"),
+        "off": lambda row: _off(row, "error_mm"),
+        "predicted MB": lambda row: f"{row['memory_mb']:,.0f}" if "memory_mb" in row else "-",
+        "reference": lambda row: f"{row.get('reference', '')} {row.get('note', '')}".strip() or "-",
+        "min of it": lambda row: _ms(row, "reference_min_ms"),
+        "median of it": lambda row: _ms(row, "reference_median_ms"),
+        "off by it": lambda row: _off(row, "reference_error_mm"),
+        "ratio": lambda row: f"{row['ratio']:.2f}" if "ratio" in row else "-",
+    }
+    table = {name: [cell(row) for row in rows] for name, cell in columns.items()}
+    table = {name: cells for name, cells in table.items() if set(cells) != {"-"}}
+    lines = _head(list(table), text=_TEXT)
+    return lines + ["| " + " | ".join(cells) + " |" for cells in zip(*table.values(), strict=True)]
 
 
 def _roofline(rows: Sequence[Row]) -> list[str]:
@@ -74,12 +94,25 @@ def _roofline(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         if row["what"].startswith("device: "):
             lines.append(f"- {row['what'][8:]}: {row['rate'] / 1e9:,.1f} G")
-    names = ["faces", "batch", "what", "min", "median", "GFLOP", "MB", "floor", "bound by", "GFLOP/s", "achieved"]
-    lines += ["", *_head(names, text=("what", "bound by"))]
+    names = [
+        "faces",
+        "batch",
+        "network",
+        "what",
+        "min",
+        "median",
+        "GFLOP",
+        "MB",
+        "floor",
+        "bound by",
+        "GFLOP/s",
+        "achieved",
+    ]
+    lines += ["", *_head(names, text=_TEXT)]
     for row in rows:
         if row["what"].startswith("device: "):
             continue
-        cells = [_count(row, "faces"), _count(row, "batch"), row["what"]]
+        cells = [_count(row, "faces"), _count(row, "batch"), row.get("network", "-"), row["what"]]
         if "note" in row:
             cells += ["-"] * 5 + [row["note"], "-", "-"]
         else:
@@ -93,9 +126,9 @@ def _roofline(rows: Sequence[Row]) -> list[str]:
 def _profile(rows: Sequence[Row]) -> list[str]:
     keys = ["warp_launches", "torch_operators", "refits", "host_reads", "synchronisations", "launches"]
     keys += ["graph_launches", "copies"]
-    lines = _head(["faces", "batch", "what", *(key.replace("_", " ") for key in keys)], text=("what",))
+    lines = _head(["faces", "batch", "network", "what", *(key.replace("_", " ") for key in keys)], text=_TEXT)
     for row in rows:
-        cells = [_count(row, "faces"), _count(row, "batch"), row["what"]]
+        cells = [_count(row, "faces"), _count(row, "batch"), row.get("network", "-"), row["what"]]
         if "note" in row:
             cells[-1] += f": {row['note']}"
         cells += [f"{row[key]:g}" if key in row else "-" for key in keys]
@@ -118,6 +151,10 @@ def _ms(row: Row, key: str) -> str:
     return f"{row[key]:,.3g}" if row.get(key, 1000.0) < 100.0 else f"{row[key]:,.0f}" if key in row else "-"
 
 
+def _off(row: Row, key: str) -> str:
+    return f"{row[key]:.1e}" if key in row else "-"
+
+
 def plot(path: Path, about: dict[str, str], rows: Sequence[Row]) -> None:
     """Draws the parts that were run: ratios by stage, time over batch, roofline."""
     import matplotlib
@@ -137,14 +174,15 @@ def plot(path: Path, about: dict[str, str], rows: Sequence[Row]) -> None:
 
 
 def _ratios(axis, rows: Sequence[Row]) -> None:
+    def name(row: Row) -> str:
+        return re.sub(r", \d.*", "", row["what"]) + f"\n{row['reference']}"  # without its number of contacts
+
     rows = [row for row in rows if "ratio" in row]
-    names = list(dict.fromkeys(f"{row['what'].split(',')[0]}\n{row['reference']}" for row in rows))
+    names = list(dict.fromkeys(name(row) for row in rows))
     sizes = sorted({row["faces"] for row in rows})
     for k, size in enumerate(sizes):
-        found = {
-            f"{row['what'].split(',')[0]}\n{row['reference']}": row["ratio"] for row in rows if row["faces"] == size
-        }
-        at = [i + 0.8 * (k + 0.5) / len(sizes) - 0.4 for i, name in enumerate(names) if name in found]
+        found = {name(row): row["ratio"] for row in rows if row["faces"] == size}
+        at = [i + 0.8 * (k + 0.5) / len(sizes) - 0.4 for i, n in enumerate(names) if n in found]
         axis.plot([found[n] for n in names if n in found], at, "o", markersize=5, label=f"{size:,} faces")
     axis.set_yticks(range(len(names)), names, fontsize=6)
     axis.grid(axis="x", alpha=0.3)
@@ -157,15 +195,18 @@ def _ratios(axis, rows: Sequence[Row]) -> None:
 
 
 def _batches(axis, rows: Sequence[Row]) -> None:
-    for size in sorted({row["faces"] for row in rows}):
-        mine = [row for row in rows if row["faces"] == size and row["what"] == "frame per garment"]
-        mine.sort(key=lambda row: row["batch"])
-        if mine:
-            batches = [row["batch"] for row in mine]
-            (line,) = axis.plot(batches, [row["min_ms"] for row in mine], "o-", label=f"{size:,} faces")
+    rows = [row for row in rows if row["what"] == "frame per garment"]
+    networks = list(dict.fromkeys(row["network"] for row in rows))
+    for k, size in enumerate(sorted({row["faces"] for row in rows})):
+        for network, style in zip(networks, ("-", "--", ":", "-.") * len(networks), strict=False):
+            mine = [row for row in rows if row["faces"] == size and row["network"] == network]
+            mine.sort(key=lambda row: row["batch"])
+            batches, drawn = [row["batch"] for row in mine], {"color": f"C{k % 10}"}
+            label = f"{size:,} faces, {network}"
+            axis.plot(batches, [row["min_ms"] for row in mine], "o", linestyle=style, label=label, **drawn)
             loops = [row for row in mine if "ratio" in row]
-            style = {"marker": "x", "linestyle": ":", "color": line.get_color()}
-            axis.plot([row["batch"] for row in loops], [row["reference_min_ms"] for row in loops], **style)
+            drawn |= {"marker": "x", "linestyle": "none"}
+            axis.plot([row["batch"] for row in loops], [row["reference_min_ms"] for row in loops], **drawn)
     axis.set_xscale("log", base=2)
     axis.set_yscale("log")
     axis.axhline(1e3 / 30, color="black", linewidth=0.8)
@@ -180,15 +221,18 @@ def _roofs(axis, rows: Sequence[Row]) -> None:
     points = [row for row in rows if "operations" in row]
     where = [row["operations"] / row["bytes"] for row in points] or [1.0]
     intensity = np.geomspace(min(0.5, *where) / 2, 4 * max(where), 200)
+    networks = list(dict.fromkeys(row["network"] for row in points))
     for name, colour in (("float32", "tab:blue"), ("bfloat16", "tab:orange")):
         roof = np.minimum(rates[name], intensity * rates["copy"])
         axis.plot(intensity, roof / 1e9, color=colour, label=f"{name}, measured roof")
-        mine = [row for row in points if row["what"].endswith(name)]
-        at = [row["operations"] / row["bytes"] for row in mine]
-        axis.scatter(at, [row["rate"] / 1e9 for row in mine], color=colour, s=18)
-        for x, row in zip(at, mine, strict=True):
-            place = {"xytext": (4, -8), "textcoords": "offset points", "fontsize": 5, "color": colour}
-            axis.annotate(f"{row['faces']:,} x {row['batch']}", (x, row["rate"] / 1e9), **place)
+        for network, marker in zip(networks, "o^sD" * len(networks), strict=False):
+            mine = [row for row in points if row["what"].endswith(name) and row["network"] == network]
+            at = [row["operations"] / row["bytes"] for row in mine]
+            rates_of = [row["rate"] / 1e9 for row in mine]
+            axis.scatter(at, rates_of, color=colour, s=18, marker=marker, label=f"{name}, {network}")
+            for x, y, row in zip(at, rates_of, mine, strict=True):
+                place = {"xytext": (4, -8), "textcoords": "offset points", "fontsize": 5, "color": colour}
+                axis.annotate(f"{row['faces']:,} x {row['batch']}", (x, y), **place)
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_xlabel("operations per byte")

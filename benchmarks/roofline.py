@@ -6,8 +6,14 @@ every operator reads its inputs and writes its outputs once: per token and layer
     norms 4, q, k, v 1 + 3 - 2 m, attention 4 - 2 m, output 2, residual sums 6, feed-forward 2 + 4 W/E
 
 with m the share of manifold heads and W the feed-forward width, plus all parameters once, the geodesic weights once a
-layer, and the stacked features. The floor of a call is the larger of operations over the matrix rate and bytes over
-the copy bandwidth, both measured here in the same run; the achieved share is that floor over the measured time.
+layer, and the stacked features. In a network of patches these tokens are the patches; per face, of width F in K face
+layers of hidden width G,
+
+    embedding 1, pooling 1, spreading 4, answer 3 + 12/F, the layer before 7 + 4 G/F, each after 10 + 8 G/F
+
+in units of F, the indices and shares of pools and neighbours once, and per patch 3 F + 5 E for the way to its width and
+back. The floor of a call is the larger of operations over the matrix rate and bytes over the copy bandwidth, both
+measured here in the same run; the achieved share is that floor over the measured time.
 """
 
 from __future__ import annotations
@@ -17,12 +23,16 @@ from collections.abc import Iterator, Sequence
 import torch
 
 from warpgarment.config import NetworkConfig
+from warpgarment.garment import POOLED
 from warpgarment.kernels.features import FEATURES
+from warpgarment.patches import SHARES, PatchLayout
+from warpgarment.pooled_geodesics import CENTRES, NEAR
 from warpgarment.simulator import Simulator
 from warpgarment.training.flops import forward_flops
 
 from .batch import scenes_of
 from .measure import NO_GPU, Row, figures, interleaved
+from .networks import Named
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 MATRIX = {"cpu": 1536, "cuda": 8192}
@@ -30,14 +40,25 @@ COPIED = {"cpu": 2**28, "cuda": 2**30}  # bytes
 TOKENS = {"cpu": 8192, "cuda": 131_072}  # faces in a batch
 
 
-def network_bytes(config: NetworkConfig, faces: int, components: int, batch: int, parameters: int, size: int) -> int:
+def network_bytes(
+    config: NetworkConfig, faces: int, components: int, batch: int, parameters: int, size: int, patches: int = 0
+) -> int:
     """Bytes as counted above; `size` of a number."""
-    e, tokens = config.embedding, batch * (faces + components)
+    e, nodes = config.embedding, patches or faces
     manifold = config.manifold_heads / config.heads
-    layer = 4 + (4 - 2 * manifold) + (4 - 2 * manifold) + 2 + 6 + 2 + 4 * config.feed_forward / e
-    weights = faces**2 if config.manifold_heads else 0
+    layer = e * (4 + (4 - 2 * manifold) + (4 - 2 * manifold) + 2 + 6 + 2) + 4 * config.feed_forward
+    weights = nodes**2 if config.manifold_heads else 0
+    indices = 0
+    if not patches and faces > POOLED:
+        weights, indices = CENTRES**2 + 2 * NEAR * faces, config.layers * 8 * 2 * NEAR * faces
+    numbers = config.layers * (batch * (nodes + components) * layer + weights) + parameters
     stacked = 4 * config.history * FEATURES * batch * faces
-    return int(size * (config.layers * (tokens * e * layer + weights) + parameters) + stacked)
+    if patches:
+        width, hidden = config.face_embedding, config.face_feed_forward
+        each = 16 * width + 4 * hidden + 12 + config.face_layers * (10 * width + 8 * hidden)
+        numbers += batch * (faces * each + patches * (3 * width + 5 * e))
+        indices = faces * (2 * 12 * SHARES + 8 * 3 * config.face_layers)  # once: the batch shares its garment
+    return int(size * numbers + stacked + indices)
 
 
 def device_rates(device: torch.device, seconds: float) -> dict[str, float]:
@@ -56,15 +77,24 @@ def device_rates(device: torch.device, seconds: float) -> dict[str, float]:
 
 
 def rows(
-    faces: Sequence[int], batches: Sequence[int], device: torch.device, weights: str, seconds: float
+    faces: Sequence[int], batches: Sequence[int], device: torch.device, networks: Sequence[Named], seconds: float
 ) -> Iterator[Row]:
     """The device's rates, then one row per size, batch and precision."""
     rates = device_rates(device, seconds)
     for name, rate in rates.items():
         unit = "bytes" if name == "copy" else "operations"
         yield {"part": "roofline", "what": f"device: {name}, {unit} per second", "rate": rate}
-    simulator = Simulator.from_pretrained(weights, device=device)
-    config, parameters = simulator.network.config, simulator.network.parameter_count()
+    for label, network in networks:
+        for row in _rows(faces, batches, Simulator(network, device), seconds, rates):
+            yield row | {"network": label}
+    if device.type == "cpu":
+        yield {"part": "roofline", "what": "network", "device": "cuda", "note": NO_GPU}
+
+
+def _rows(
+    faces: Sequence[int], batches: Sequence[int], simulator: Simulator, seconds: float, rates: dict[str, float]
+) -> Iterator[Row]:
+    device, config, parameters = simulator.device, simulator.network.config, simulator.network.parameter_count()
     for size in faces:
         for number in batches:
             if number > 1 and number * size > TOKENS[device.type]:
@@ -84,9 +114,11 @@ def rows(
                     scene.predict(stacked, velocities)
 
             calls = {"float32": lambda call=call: call(False), "bfloat16": lambda call=call: call(True)}
-            operations = number * sum(forward_flops(config, count, components))
+            layout = scene.views[0].weights
+            patches = layout.start.shape[1] if isinstance(layout, PatchLayout) else 0
+            operations = number * sum(forward_flops(config, count, components, patches))
             for name, times in interleaved(calls, device, seconds).items():
-                moved = network_bytes(config, count, components, number, parameters, PRECISIONS[name].itemsize)
+                moved = network_bytes(config, count, components, number, parameters, PRECISIONS[name].itemsize, patches)
                 measured = figures(times)
                 floor = 1e3 * max(operations / rates[name], moved / rates["copy"])
                 yield {
@@ -102,5 +134,3 @@ def rows(
                     "achieved": floor / measured["min_ms"],
                     "rate": 1e3 * operations / measured["min_ms"],
                 }
-    if device.type == "cpu":
-        yield {"part": "roofline", "what": "network", "device": "cuda", "note": NO_GPU}

@@ -16,7 +16,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, 
 
 from .batch import Rolling, scenes_of
 from .measure import RESULTS, Row, figures, interleaved, machine
+from .networks import Named
 from .scenes import dressed
 
 WORLDS = {"cpu": (1, 4), "cuda": (1, 4, 16, 64, 256, 1024)}
@@ -79,24 +80,27 @@ def rows(teacher: str, device: str, sizes: list[int], worlds: list[int], frames:
             }
 
 
-def against(faces: list[int], device: torch.device, weights: str, frames: int) -> Iterator[Row]:
+def against(faces: list[int], device: torch.device, networks: Sequence[Named], frames: int) -> Iterator[Row]:
     """Whole frames of the simulator and of Newton's VBD, the same garment on the same body, one at a time."""
-    simulator = Simulator.from_pretrained(weights, device=device)
     for size in faces:
         scene = world(size, frames + 1, 32)
         base = {"part": "teacher", "what": "whole frame", "faces": len(scene.cloths[0].garment.faces), "batch": 1}
+        reference = {"reference": "Newton VBD, 10 substeps of 5 iterations"}
         try:
             stream = make_teacher("newton", str(device)).simulate_many([scene])
             next(stream)
         except TeacherError as error:
             yield base | {"reference": "Newton VBD", "note": str(error).splitlines()[0]}
             continue
-        rolling = Rolling(simulator, scenes_of([size], 1))
-        times = interleaved({"": rolling, "VBD": lambda s=stream: next(s)}, device, 1e9, most=frames - 1)
-        mine = figures(times[""])
+        rolling = {
+            f"ours: {label}": Rolling(Simulator(network, device), scenes_of([size], 1)) for label, network in networks
+        }
+        times = interleaved({**rolling, "VBD": lambda s=stream: next(s)}, device, 1e9, most=frames - 1)
         theirs = {f"reference_{key}": value for key, value in figures(times["VBD"]).items()}
-        reference = {"reference": "Newton VBD, 10 substeps of 5 iterations"}
-        yield base | mine | reference | theirs | {"ratio": theirs["reference_min_ms"] / mine["min_ms"]}
+        for label, _ in networks:
+            mine = figures(times[f"ours: {label}"])
+            ratio = theirs["reference_min_ms"] / mine["min_ms"]
+            yield base | {"network": label} | mine | reference | theirs | {"ratio": ratio}
 
 
 def settings(teacher: str) -> dict[str, Any]:

@@ -7,12 +7,17 @@ import re
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from test_simulator import network, skirt, tube, walk
 
 from warpgarment import memory
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.garment import Garment
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.kernels.collision_operator import _parts as parts
+from warpgarment.kernels.factor import Factor
+from warpgarment.kernels.poisson import PoissonSolver
+from warpgarment.network import NetworkConfig, build_network
+from warpgarment.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
 from warpgarment.simulator import Simulator
 
 FACTOR = 1.5
@@ -36,7 +41,26 @@ def allocated(call) -> int:
     return int(np.cumsum(changes).max())
 
 
-SMALL, BASE = NetworkConfig.small(layers=1), NetworkConfig.base(layers=1)
+def pooled(around: int, along: int) -> Garment:
+    """The same with made-up distances between centres, as garments beyond 10,000 faces have them."""
+    made = Garment(*tube(around, along, bottom=-0.3, top=0.3))
+    centroids = made.vertices[made.faces].mean(axis=1)
+    centres = centroids[np.linspace(0, len(centroids) - 1, CENTRES).astype(int)]
+    length, nearest = cKDTree(centres).query(centroids, NEAR)
+    weight = 1.0 / (length + 0.01)
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2).astype(np.float32)
+    made.__dict__["pooled_geodesics"] = PooledGeodesics(
+        distances, nearest.astype(np.int32), (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    )
+    return made
+
+
+def factor_of(solver) -> list[torch.Tensor]:
+    """The factor among what a solver's operator is given, found as the solver itself finds it."""
+    return list(solver._model[-len(Factor._fields) :]) if isinstance(solver, PoissonSolver) else parts(solver._model)[2]
+
+
+SMALL, BASE, FAST = (kind(layers=1) for kind in (NetworkConfig.small, NetworkConfig.base, NetworkConfig.fast))
 ONE, MANY = garment(32, 17), [garment(around, 13) for around in (12, 16, 22, 24, 28, 32)]
 
 
@@ -50,25 +74,38 @@ ONE, MANY = garment(32, 17), [garment(around, 13) for around in (12, 16, 22, 24,
         ([MANY[1]] * 8, BASE, {}),
         ([MANY[1]] * 8, BASE, {"half": True}),
         ([garment(64, 40)], SMALL, {"face_splits": 8}),
+        ([ONE], FAST, {}),
+        (MANY, FAST, {}),
+        ([MANY[1]] * 8, FAST, {"half": True}),
+        ([pooled(128, 41)], SMALL, {"face_splits": 4}),
+        ([pooled(128, 41)], FAST, {}),
     ],
 )
 def test_prediction(garments, config, options):
     """A batch would be refused that fits, or taken that does not. Within 1.5 of torch's own count, setting up included.
 
-    Geodesic distances are NumPy's and counted apart. The last has too many vertices for a compliance matrix.
+    Geodesic distances and factors lie in NumPy's memory and are counted apart. The last three have too many vertices
+    for a compliance matrix, the last two too many faces for a matrix of all pairs of them.
     """
     motion = walk(2)
     splits = {k: v for k, v in options.items() if k == "face_splits"}
-    sim = Simulator(ManifoldAwareTransformer(config), "cpu", half=options.get("half", False))
+    sim = Simulator(build_network(config), "cpu", half=options.get("half", False))
+    scenes = []
 
     def run():
         state = sim.start(garments, motion.vertices[0], motion.faces, **splits)
         sim.step(state, motion.vertices[1])
+        scenes.append(state.scene)
 
-    distances = sum(g.geodesics.nbytes for g in {id(g): g for g in garments}.values())
-    measured = allocated(run) + distances
+    unique = {id(g): g for g in garments}.values()
+    arrays = [] if config is FAST else [a for g in unique for a in (g.pooled_geodesics if g.pools else [g.geodesics])]
+    distances = sum(array.nbytes for array in arrays)
+    measured = allocated(run)
+    factors = sum(tensor.nbytes for solver in (scenes[0].poisson, scenes[0].collision) for tensor in factor_of(solver))
+    measured += distances + factors
     predicted = memory.predict(garments, [motion], config, **options)
     assert predicted.parts["geodesic distances"] == distances
+    assert 1 / FACTOR < predicted.parts["factors of the solvers"] / factors < FACTOR
     ratio = (predicted.total - predicted.parts["bodies"]) / measured
     assert 1 / FACTOR < ratio < FACTOR, f"{predicted}, measured {measured / 1e6:.1f} MB"
 

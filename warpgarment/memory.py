@@ -22,7 +22,7 @@ from warpgarment.body import BodyMotion
 from warpgarment.config import NetworkConfig
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.garment import Garment
-from warpgarment.kernels import compliance
+from warpgarment.kernels import compliance, factor
 from warpgarment.kernels.features import FEATURES
 from warpgarment.pooled_geodesics import CENTRES, NEAR
 
@@ -34,7 +34,13 @@ GRAPHED = 3  # copies of the history on a GPU: that of a state, and what a graph
 MAKING_WEIGHTS = 2.3  # matrices besides the result while geodesic weights are made
 INVERTING = 3  # float64 matrices while the compliance of a component is made
 STACKS = (6.0, 4.0)  # copies of the stacked features, while they are prepared and while the network runs
+PATCH_STACKS = (1.0, 3.0)  # the same of a network of patches, for a single garment and for several
 TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps some more, of half the size
+LANES = 16  # rows of compliance matrices are padded to a multiple of it
+POISSON_FACTOR, COLLISION_FACTOR = 36.0, 85.0  # bytes for V log2 V of a component, for substitution
+EXPLICIT_FACTOR = 80.0  # bytes for V^1.5, inverted
+FACTOR_ENTRY = 12  # bytes
+BAG_ENTRY = 12  # bytes of an entry of a sparse matrix: a column and a weight
 MORE_SPLITS = (2, 4, 8, 16, 32, 64)
 
 
@@ -91,18 +97,28 @@ def predict(
     hidden = config.face_feed_forward if patches else config.feed_forward
     weights, largest, network = 0, 0, 0
     stack = 4 * config.history * FEATURES
+    stacks = STACKS
+    if patches:
+        stacks = (PATCH_STACKS[len(garments) > 1],) * 2
     for group in groups:
         length = max(count for _, _, count in group)
         shared = len({(id(garments[g]), first) for g, first, _ in group}) == 1
         rows = 1 if shared else len(group)
-        each = 0 if patches or not config.manifold_heads else _weights(garments[group[0][0]], length)
-        matrices = rows * each
-        weights += 4 * matrices + (rows * length * PER_PATCHED_FACE if patches else 0)
+        pooled = garments[group[0][0]].pools and not patches
+        if pooled and config.manifold_heads:
+            each = CENTRES**2
+            matrices = each * len({id(garments[g]) for g, _, _ in group})
+            weights += rows * length * (2 * NEAR * BAG_ENTRY + 12) + 8 * rows * CENTRES
+        else:
+            each = 0 if patches or not config.manifold_heads else length**2
+            matrices = rows * each
+            weights += rows * length * PER_PATCHED_FACE if patches else 0
+        weights += 4 * matrices
         largest = max(largest, 4 * each)
-        inside = STACKS[1] * stack + (2 * (TOKENS + 1.5) if half else 4 * TOKENS) * width
+        inside = stacks[1] * stack + (2 * (TOKENS + 1.5) if half else 4 * TOKENS) * width
         inside += 4 * max(0, 2 * hidden - 3 * width)
-        activations = len(group) * length * max(STACKS[0] * stack, inside)
-        network = max(network, int(activations) + (2 * matrices if half else 0))
+        activations = len(group) * length * max(stacks[0] * stack, inside)
+        network = max(network, int(activations) + (2 * matrices if half and not pooled else 0))
 
     blocks, scratch, inverted = _compliance(garments)
     passing = {
@@ -115,10 +131,11 @@ def predict(
     return Memory(
         {
             "geodesic weights": weights,
-            "geodesic distances": sum(4 * _weights(g, len(g.faces)) for g in unique)
+            "geodesic distances": sum(4 * _distances(g) for g in unique)
             if cpu and config.manifold_heads and not patches
             else 0,
             "compliance of collisions": blocks,
+            "factors of the solvers": _factors(unique, cpu),
             "history of features": (1 if cpu else GRAPHED) * stack * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
             "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
@@ -181,9 +198,21 @@ def check(
     )
 
 
-def _weights(garment: Garment, faces: int) -> int:
-    """Entries of the geodesic weights of so many faces of a garment: of each pair, or between the centres of pools."""
-    return CENTRES**2 + 2 * NEAR * faces if garment.pools else faces**2
+def _distances(garment: Garment) -> int:
+    """Numbers that geodesic weights are made from: of each pair, or between the centres of pools and to them."""
+    count = len(garment.faces)
+    return CENTRES**2 + 2 * NEAR * count if garment.pools else count**2
+
+
+def _factors(garments: Sequence[Garment], cpu: bool) -> int:
+    """Bytes of the factors of the Poisson matrix and, on a CPU, of collisions that have no compliance matrix."""
+    poisson = collisions = 0.0
+    for garment in garments:
+        for size in np.bincount(garment.components[0]):
+            sparse = size * np.log2(max(size, 2))
+            poisson += POISSON_FACTOR * sparse if cpu else EXPLICIT_FACTOR * size**1.5
+            collisions += COLLISION_FACTOR * sparse if cpu and size > compliance.LARGEST else 0.0
+    return sum(int(min(n, FACTOR_ENTRY * factor.BUDGET)) for n in (poisson, collisions))
 
 
 def _compliance(garments: Sequence[Garment]) -> tuple[int, int, int]:
@@ -193,7 +222,7 @@ def _compliance(garments: Sequence[Garment]) -> tuple[int, int, int]:
     for garment in garments:
         of_vertex = garment.components[0]
         for component, size in enumerate(np.bincount(of_vertex)):
-            entries = int(size) ** 2
+            entries = int(size) * (-(-int(size) // LANES) * LANES)
             if size > compliance.LARGEST or needed + entries > compliance.BUDGET:
                 continue
             needed, largest = needed + entries, max(largest, entries)

@@ -1,0 +1,44 @@
+"""The networks whose speed is measured: trained ones, or shapes without training, which are as fast."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from warpgarment import checkpoint
+from warpgarment.config import NetworkConfig
+from warpgarment.errors import CheckpointError
+from warpgarment.network import GarmentNetwork, build_network
+
+SHAPES = {"small": NetworkConfig.small, "fast": NetworkConfig.fast, "base": NetworkConfig.base}
+DEFAULT = ("small", "fast")
+
+
+class Named(NamedTuple):
+    """A network and what rows call it."""
+
+    label: str
+    network: GarmentNetwork
+
+
+def named(names: Sequence[str]) -> list[Named]:
+    """Networks by name: one that ships, or a file; `small`, `fast` or `base` that does not ship is made untrained.
+
+    An untrained network of `small` or `fast` moves the cloth as the body moves; that of `base` moves it anywhere, so
+    that its collisions take longer than a trained one's.
+    """
+    return [_named(name) for name in names]
+
+
+def _named(name: str) -> Named:
+    try:
+        path = checkpoint.find(name)
+    except CheckpointError:
+        if name not in SHAPES:
+            raise
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            return Named(f"{name}, untrained", build_network(SHAPES[name]()))
+    return Named(name, checkpoint.load(path))
