@@ -6,7 +6,7 @@ the angles around a vertex sum to more than 2π (Mitchell, Mount and Papadimitri
 1. From every face centroid and every such vertex, unfold the strips of faces around it into the plane, keeping for
    each strip the window of directions that stay inside, and note what is seen through it: exact distances to the
    neighbourhood.
-2. Chain these segments with Dijkstra's algorithm.
+2. Chain these segments: `kernels/shortest_paths.py`.
 
 `face_geodesics` does this for all pairs, `local_geodesics` for pairs within a radius, without a matrix of F x F.
 
@@ -24,6 +24,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from .errors import MeshError
+from .kernels.shortest_paths import Paths, neighbourhoods, unit_of
 from .mesh_checks import check_edges, checked_faces, checked_positions, complain, no_area, repeated_vertices
 
 REACH = 2.5  # windows end this many times the source's longest edge away,
@@ -32,7 +33,8 @@ LEAST_DEPTH = 4  # but not before they have crossed this many faces,
 DEPTH = 400  # and in any case after this many
 SADDLE = 1e-3  # angle beyond 2 pi from which a vertex can bend a shortest path [rad]
 BLOCK = 512  # sources of one search of local distances
-VERSION = 1  # raise it whenever the result changes: it is part of the name under which results are kept
+FEW = 8  # sources, up to which preparing a graph for the faster search takes longer than it saves
+VERSION = 2  # raise it whenever the result changes: it is part of the name under which results are kept
 MEMORY_BUDGET = 8 * 2**30  # bytes of float32 distances that are still computed: about 46,000 faces
 
 
@@ -58,19 +60,15 @@ def face_geodesics(rest_vertices: Any, faces: Any) -> np.ndarray:
             f"Distances between {len(faces):,} faces need {need / 2**30:.0f} GiB, more than "
             f"{MEMORY_BUDGET / 2**30:.0f}. Coarsen the garment, or raise warpgarment.geodesics.MEMORY_BUDGET."
         )
-    distances = distances_from(surface_graph(vertices, faces), np.arange(len(faces)), len(faces))
-    np.minimum(
-        distances, distances.T, out=distances
-    )  # the same path summed from its other end may differ in the last bit
-    np.fill_diagonal(distances, 0.0)
-    return distances
+    every = np.arange(len(faces))
+    return Paths(surface_graph(vertices, faces), every).distances(every)
 
 
 def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix:
     """Distances over the surface between face centroids no further apart than a radius, a row per face.
 
     A path no longer than the radius stays in the ball of that radius around its start. So sources are taken in blocks
-    of neighbours, and Dijkstra's algorithm sees only the part of the graph around a block: time and memory grow with
+    of neighbours, and the search sees only the part of the graph around a block: time and memory grow with
     the number of pairs found.
 
     Args:
@@ -80,7 +78,7 @@ def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix
 
     Returns:
         Distances [m], float32, shape [F,F], symmetric, columns sorted. The diagonal is stored, as zeros; pairs further
-        apart are not stored. Stored values are those of `face_geodesics`, to the last bit but one.
+        apart are not stored. Stored values are those of `face_geodesics`.
 
     Raises:
         MeshError: As `face_geodesics`; pairs beyond `MEMORY_BUDGET`.
@@ -124,17 +122,18 @@ def searches(
     """
     mesh = _Unfolding(vertices.astype(np.float64), faces.astype(np.int64))
     graph, count = _segments(mesh), len(faces)
+    unit = unit_of(graph)
     nodes = np.concatenate([vertices[faces].mean(axis=1), vertices[mesh.node_of_vertex >= 0]]).astype(np.float64)
     del mesh
-    for chosen in _neighbourhoods(nodes[sources]):
+    for chosen in neighbourhoods(nodes[sources], BLOCK):
         block = sources[chosen]
         low, high = nodes[block].min(axis=0) - 1.001 * radius, nodes[block].max(axis=0) + 1.001 * radius
         inside = np.nonzero(((nodes >= low) & (nodes <= high)).all(axis=1))[0]
         of_faces = np.searchsorted(inside, count)
-        part = dijkstra(
-            graph[inside][:, inside], indices=np.searchsorted(inside, block), limit=radius * (1 + 1e-6)
-        )  # rounded to float32 before they are compared, so that ties end as they do in the dense matrix
-        yield block, inside[:of_faces], part[:, :of_faces].astype(np.float32)
+        part = Paths(graph[inside][:, inside], np.arange(of_faces), unit).distances(
+            np.searchsorted(inside, block), radius * (1 + 1e-6)
+        )  # float32 before they are compared, so that ties end as they do in the dense matrix
+        yield block, inside[:of_faces], part
 
 
 def _stacked(upper: csr_matrix, diagonal: csr_matrix) -> csr_matrix:
@@ -149,19 +148,6 @@ def _stacked(upper: csr_matrix, diagonal: csr_matrix) -> csr_matrix:
     return result
 
 
-def _neighbourhoods(points: np.ndarray) -> Iterator[np.ndarray]:
-    """Indices of points in blocks of neighbours, by halving along the longest side of the bounding box."""
-    waiting = [np.arange(len(points))]
-    while waiting:
-        block = waiting.pop()
-        if len(block) <= BLOCK:
-            yield np.sort(block)
-            continue
-        axis = np.ptp(points[block], axis=0).argmax()
-        order = block[np.argsort(points[block, axis], kind="stable")]
-        waiting += [order[len(order) // 2 :], order[: len(order) // 2]]
-
-
 def checked_mesh(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
     """Float32 vertices and int32 faces of a mesh that paths can be found on; raises MeshError."""
     vertices = checked_positions(rest_vertices, name="rest_vertices")
@@ -172,13 +158,11 @@ def checked_mesh(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray
 
 
 def distances_from(graph: csr_matrix, sources: np.ndarray, face_count: int) -> np.ndarray:
-    """Distances [m] from some faces to all, float32, shape [S,F], over a graph of `surface_graph`."""
-    result = np.empty((len(sources), face_count), dtype=np.float32)
-    block = max(1, 16_000_000 // graph.shape[0])
-    for start in range(0, len(sources), block):
-        part = dijkstra(graph, directed=True, indices=sources[start : start + block])
-        result[start : start + block] = part[:, :face_count]
-    return result
+    """Distances [m] from some faces to all, float32, shape [S,F], over a graph of `surface_graph`. Those of fewer than
+    `FEW` faces are sums of float64, and may differ in the last bit from those of many."""
+    if len(sources) < FEW:
+        return dijkstra(graph, indices=sources)[:, :face_count].astype(np.float32)
+    return Paths(graph, np.arange(face_count)).distances(sources)
 
 
 def surface_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:

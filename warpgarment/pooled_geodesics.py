@@ -26,12 +26,13 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from .geodesics import checked_mesh, searches
+from .kernels.shortest_paths import Paths
 
 CENTRES = 4096  # at most; D_c takes 64 MiB
 NEAR = 12  # centres a face is interpolated from
 NEAR_REACH, CHAIN_REACH = 3.0, 6.0  # how far these are, and the links between centres, in fill distances
 LARGEST_ROW = 6.0  # sum of absolute entries of a row of P, beyond which it is replaced by a plain mean
-VERSION = 1  # raise it whenever the result changes: it is part of the name under which results are kept
+VERSION = 2  # raise it whenever the result changes: it is part of the name under which results are kept
 
 
 class PooledGeodesics(NamedTuple):
@@ -67,7 +68,7 @@ def pooled_geodesics(rest_vertices, faces, centres: int = CENTRES) -> PooledGeod
         near.append((inside[column].astype(np.int32), number[block[row]].astype(np.int32), part[row, column]))
     source, target, length = (np.concatenate(parts) for parts in zip(*links, strict=True))
     graph = csr_matrix((length.astype(np.float64), (source, target)), shape=(len(chosen),) * 2)
-    distances = dijkstra(graph).astype(np.float32)
+    distances = Paths(graph, np.arange(len(chosen))).distances(np.arange(len(chosen)))
     np.minimum(distances, distances.T, out=distances)
     index, length = _nearest(len(faces), *(np.concatenate(parts) for parts in zip(*near, strict=True)))
     return PooledGeodesics(distances, index, _interpolation(corners, chosen, index, length))
