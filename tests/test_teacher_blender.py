@@ -175,17 +175,16 @@ def test_several_cloths_are_kept_further_apart():
     def told(count: int, cells: int) -> tuple[float, float]:
         sheet = _sheet(cells=cells)
         scene = ClothScene(tuple(Cloth(sheet, 0.04) for _ in range(count)), frames=1)
-        edges = np.concatenate([np.diff(sheet.vertices[sheet.faces[:, c]], axis=1) for c in ([0, 1], [1, 2], [2, 0])])
-        return blender_numbers(scene, BlenderSettings())[0]["collision"]["self_distance_min"], float(
-            np.linalg.norm(edges, axis=-1).mean()
-        )
+        ends = sheet.vertices[sheet.edges].astype(np.float64)
+        mean = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+        return blender_numbers(scene, BlenderSettings())[0]["collision"]["self_distance_min"], mean
 
     settings = BlenderSettings()
     one, mean = told(1, 6)
     assert mean > 4 * settings.layer_distance, "coarse enough for the whole distance"
     assert told(2, 6)[0] / one == pytest.approx(settings.layer_distance / settings.self_distance)
     fine, mean = told(2, 20)
-    assert fine / one == pytest.approx(0.25 * mean / settings.self_distance, rel=0.05)  # inner edges count twice here
+    assert fine / one == pytest.approx(0.25 * mean / settings.self_distance)
 
 
 def test_numbers_stand_for_the_material():

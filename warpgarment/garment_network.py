@@ -22,6 +22,7 @@ import torch
 from torch import nn
 
 from warpgarment import heading as _heading
+from warpgarment.attention import EncoderLayer
 from warpgarment.config import NetworkConfig
 from warpgarment.kernels.features import FEATURES
 from warpgarment.parametrisation import NetworkOutput
@@ -97,6 +98,22 @@ class GarmentNetwork(nn.Module):
             self.register_buffer(name, start)
         self.psi_mean.copy_(torch.eye(3).flatten())
         self.singular_value_mean.fill_(1.0)
+
+    def encoder_layers(self) -> nn.ModuleList:
+        """The encoder over tokens of `config.embedding`, untrained."""
+        config = self.config
+        return nn.ModuleList(
+            EncoderLayer(
+                config.embedding,
+                config.feed_forward,
+                config.heads,
+                config.manifold_heads,
+                dropout=config.dropout,
+                norm_first=config.norm_first,
+                activation=config.activation,
+            )
+            for _ in range(config.layers)
+        )
 
     def start_like_skin(self) -> None:
         """Sets the output weights of a residual network to zero."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from warpgarment.attention import EncoderLayer, geodesic_weights
+from warpgarment.attention import geodesic_weights
 from warpgarment.config import NetworkConfig
 from warpgarment.garment_network import STATISTICS, GarmentNetwork, NormalisedOutput, rotate_output
 from warpgarment.kernels.features import FEATURES
@@ -52,18 +52,7 @@ class ManifoldAwareTransformer(GarmentNetwork):
         super().__init__(config)
         self.embed_faces = nn.Linear(config.history * FEATURES, config.embedding)
         self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
-        self.layers = nn.ModuleList(
-            EncoderLayer(
-                config.embedding,
-                config.feed_forward,
-                config.heads,
-                config.manifold_heads,
-                dropout=config.dropout,
-                norm_first=config.norm_first,
-                activation=config.activation,
-            )
-            for _ in range(config.layers)
-        )
+        self.layers = self.encoder_layers()
         self.final_norm = nn.LayerNorm(config.embedding) if config.norm_first else nn.Identity()
         self.face_head = nn.Linear(config.embedding, 12)
         self.velocity_head = nn.Linear(config.embedding, 3)

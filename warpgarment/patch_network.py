@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from warpgarment import heading
-from warpgarment.attention import ACTIVATIONS, EncoderLayer
+from warpgarment.attention import ACTIVATIONS
 from warpgarment.config import NetworkConfig
 from warpgarment.garment_network import GarmentNetwork, NormalisedOutput, rotate_output
 from warpgarment.kernels.features import FEATURES
@@ -78,18 +78,7 @@ class PatchTransformer(GarmentNetwork):
         self.before = self._face_layer(hears=False)
         self.to_patches = nn.Linear(width, config.embedding)
         self.to_velocity = nn.Linear(width, config.embedding, bias=False)
-        self.layers = nn.ModuleList(
-            EncoderLayer(
-                config.embedding,
-                config.feed_forward,
-                config.heads,
-                config.manifold_heads,
-                dropout=config.dropout,
-                norm_first=config.norm_first,
-                activation=config.activation,
-            )
-            for _ in range(config.layers)
-        )
+        self.layers = self.encoder_layers()
         self.final_norm = nn.LayerNorm(config.embedding) if config.norm_first else nn.Identity()
         self.from_patches = nn.Linear(config.embedding, width)
         self.after = nn.ModuleList(self._face_layer(hears=True) for _ in range(config.face_layers))

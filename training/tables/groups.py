@@ -19,6 +19,11 @@ from .pictures import Keeper, bars, results_file, rollouts
 from .protocol import evenly, means, measure
 from .report import PROTOCOL, means_table, publish
 
+OTHERS = (
+    "What was trained on and never seen is said of this set's training split; a network trained on other data may have "
+    "seen more, or less."
+)
+
 
 @dataclass(frozen=True)
 class Group:
@@ -83,6 +88,8 @@ def make(config: Any) -> dict[str, Any]:
         raise DataLacks(f"{config.data}: too few groups can be evaluated to compare any ({reasons})")
     result = {"table": config.table, "title": title, "protocol": PROTOCOL, "rows": rows, "skipped": skipped}
     result |= {"left_out": left_out}
+    if config.tables.against:
+        note += f" {OTHERS}"
     body = [note, "", PROTOCOL, "", *means_table(rows, {"count": "sequences"})]
     body += [
         line for label in left_out for line in ("", f"No row for {label}: none of its sequences can be evaluated.")
