@@ -20,6 +20,7 @@ from warpgarment.training.losses import LossConfig, loss
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.pushforward import Pool
 from warpgarment.training.samples import Augmentation, SampleBuilder, SequenceData
+from warpgarment.training.unroll import UnrollConfig
 
 SHAPE = (
     "embedding=16", "layers=1", "feed_forward=16", "heads=2", "geodesic_radius=0.2", "face_embedding=16",
@@ -119,6 +120,15 @@ def test_run_goes_from_subsets_to_whole_garments(data, tmp_path, monkeypatch):
         train.train(config_for(data, tmp_path / "parts", **settings))
     train.train(config_for(data, tmp_path / "parts", **settings, resume=True))
     assert losses_of(tmp_path / "parts") == losses
+
+
+def test_unrolled_run_of_whole_garments(data, tmp_path):
+    """A run would fail where the schedule no longer splits garments; of patches, it shows all of each at once."""
+    settings = {"network": "fast", "overrides": SHAPE, "splits": 2, "split_share": 0.5, "steps": 4, "batch_size": 2}
+    train.train(config_for(data, tmp_path, **settings, unroll=UnrollConfig(steps=2, position=1.0)))
+    losses = losses_of(tmp_path)
+    assert sorted(losses) == [1, 2, 3, 4]
+    assert all(np.isfinite(list(losses.values())))
 
 
 def test_run_starts_from_a_network_of_faces(data, tmp_path):

@@ -114,20 +114,20 @@ class UnrolledBuilder(SampleBuilder):
     def build(
         self,
         picks: list[tuple[int, int]],
-        faces: int,
+        faces: int | None,
         rng: np.random.Generator,
         displacements: list[np.ndarray | None] | None = None,
         part: slice = slice(None),
     ) -> UnrolledBatch:
         """Builds one batch, or a part of it; as `SampleBuilder.build`, but that all faces are there, and the network
-        sees them in subsets of about `faces`."""
+        sees them in subsets of about `faces` (None: all at once)."""
         streams = rng.spawn(len(picks))[part]
         total = sum(self.sequences[s].components for s, _ in picks) / len(picks)
         picks = picks[part]
         displacements = displacements[part] if displacements else [None] * len(picks)
         history, device = self.network.history, self.device
         mine = [self.sequences[s] for s, _ in picks]
-        smallest = min(len(data.faces) for data in mine)
+        face_splits = 1 if faces is None else max(round(min(len(data.faces) for data in mine) / faces), 1)
 
         past, rows, bodies = [], [], []
         for (_, t), data, stream, override in zip(picks, mine, streams, displacements, strict=True):
@@ -155,7 +155,7 @@ class UnrolledBuilder(SampleBuilder):
             placed[0],
             torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)]),
             self.module,
-            face_splits=max(round(smallest / faces), 1),
+            face_splits=face_splits,
             epsilon=None,
             collision_passes=self.collision_passes,
             half=False,
