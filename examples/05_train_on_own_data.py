@@ -14,7 +14,6 @@ import tyro
 
 import warpgarment as wg
 from warpgarment.training.dataset import write_sequence
-from warpgarment.training.pushforward import PushforwardConfig
 from warpgarment.training.train import TrainConfig, train
 
 
@@ -49,7 +48,6 @@ def main(out: Path = Path("out/own_training"), frames: int = 60, steps: int = 60
         batch_size=batch_size,
         statistics_batches=2,
         log_every=max(1, steps // 6),
-        pushforward=PushforwardConfig(share=0.0),
     )
     path = train(config)
     for line in (out / "run" / "log.jsonl").read_text().splitlines():

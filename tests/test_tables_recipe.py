@@ -19,8 +19,8 @@ from warpgarment.training.unroll import UnrollConfig
 SHAPE = ("dropout=0.0", "embedding=16", "layers=1", "feed_forward=16", "heads=2", "manifold_heads=1")
 QUICK = (
     "batch_size=2", "validate_frames=4", "validate_sequences=1", "statistics_batches=2", "ahead=0",
-    "pushforward.every=2", "pushforward.rollouts=1", "pushforward.steps=2", "save_every=2", "validate_every=2",
-    "log_every=1",
+    "pushforward.every=2", "pushforward.rollouts=1", "pushforward.steps=2", "pushforward.share=0.25", "save_every=2",
+    "validate_every=2", "log_every=1",
 )  # fmt: skip
 ROWS = ("as_given", "paper", "lr_third", "lr_triple")
 
@@ -62,7 +62,8 @@ def five_digits(values: dict) -> dict:
 
 def test_rows_change_what_they_say_and_nothing_else(data, tmp_path):
     """A row changes more than it is about, or less: against the settings that are written out here."""
-    common = compare._common(config_for(data, tmp_path, settings=("noise.position=0.03", "lr=0.002")), "small")
+    changed = ("noise.position=0.03", "lr=0.002", "pushforward.share=0.1")
+    common = compare._common(config_for(data, tmp_path, settings=changed), "small")
     given = settings.described(common)
     found = {}
     for row in recipe.recipe(common):
@@ -105,15 +106,28 @@ def test_an_unrolled_recipe_is_compared_with_one_step(data, tmp_path):
     assert {"unrolled", "one_step"}.isdisjoint(names("compile=true"))
 
 
+def test_a_recipe_is_compared_with_and_without_push_forward(data, tmp_path):
+    """The row would change nothing."""
+
+    def names(share):
+        config = config_for(data, tmp_path, settings=(*QUICK, f"pushforward.share={share}"), rows=())
+        return {row.name: row.settings for row in compare.plan(config)[1]}
+
+    assert names(0.1)["without_pushforward"] == ("pushforward.share=0.0",)
+    assert names(0.0)["pushforward"] == ("pushforward.share=0.25",)
+    assert "pushforward" not in names(0.1)
+    assert "without_pushforward" not in names(0.0)
+
+
 def test_rows_that_would_be_the_recipe_itself_are_left_out(data, tmp_path):
-    """A recipe without push-forward would be trained twice, and its two rows would differ by nothing; asked for by
-    name, such a row is refused."""
-    without = (*QUICK, "pushforward.share=0.0")
-    _, rows = compare.plan(config_for(data, tmp_path, settings=without, rows=()))
-    assert "without_pushforward" not in {row.name for row in rows}
+    """A recipe of whole garments would be trained twice, and its two rows would differ by nothing; asked for by name,
+    such a row is refused."""
+    whole = (*QUICK, "splits=1")
+    _, rows = compare.plan(config_for(data, tmp_path, settings=whole, rows=()))
+    assert "whole_garments" not in {row.name for row in rows}
     assert len(rows) == len(recipe.recipe(TrainConfig(data=data, out=tmp_path, steps=1))) - 1
     with pytest.raises(variants.RowError, match="would be the same"):
-        compare.plan(config_for(data, tmp_path, settings=without, rows=("as_given", "without_pushforward")))
+        compare.plan(config_for(data, tmp_path, settings=whole, rows=("as_given", "whole_garments")))
 
 
 def test_the_table_says_what_changed_and_what_it_did(made):

@@ -1,7 +1,7 @@
 """The rows of the table of the recipe: one training setting changed in each, and what that did.
 
-The recipe is the one that the options give. A row that would not differ from it, such as "without push-forward" of a
-recipe that has none, is left out unless it is asked for by name.
+The recipe is the one that the options give. A row that would not differ from it, such as "whole garments" of a recipe
+that never splits them, is left out unless it is asked for by name.
 
 The row `paper` is section 4.3.2 of the paper as far as it is printed: no residual, the world's heading, its encoder
 layers, one step of supervision, Gaussian noise on the normalised features and nothing else against drift. Its sigma_n
@@ -20,6 +20,7 @@ from .settings import described, differences
 from .variants import Variant
 
 AS_GIVEN = "as_given"
+PUSHFORWARD = 0.25  # share of samples from rollouts, for a recipe that has none
 PAPER_NOISE = 0.05  # standard deviations of the normalised features
 AGREE = 2.0 / 3.0  # share of rollouts that have to side with the means for a verdict
 SMALLEST = 0.01  # change of the mean error that counts, as a share
@@ -50,7 +51,6 @@ def recipe(common: TrainConfig) -> list[Variant]:
     rows = [
         Variant(AS_GIVEN, "as given"),
         Variant("paper", "the paper's own", shape, (*plain, *gaussian)),
-        Variant("without_pushforward", "without push-forward", (), ("pushforward.share=0.0",)),
         Variant("noise_none", "history not displaced", (), displaced(0.0)),
         Variant("noise_third", "history displaced a third as far", (), displaced(1.0 / 3.0)),
         Variant("noise_triple", "history displaced three times as far", (), displaced(3.0)),
@@ -62,6 +62,10 @@ def recipe(common: TrainConfig) -> list[Variant]:
         ),
         Variant("whole_garments", "whole garments throughout", (), ("splits=1",)),
     ]
+    if common.pushforward.share:
+        rows.append(Variant("without_pushforward", "without push-forward", (), ("pushforward.share=0.0",)))
+    else:
+        rows.append(Variant("pushforward", "with push-forward", (), (f"pushforward.share={PUSHFORWARD!r}",)))
     if common.unroll.steps > 1:
         rows.append(Variant("one_step", "one step at a time", (), ("unroll.steps=1",)))
     elif not (common.compile or common.augmentation.scale):  # which unrolled training does not know
