@@ -87,7 +87,7 @@ def batch_of(loaded, network, picks, *, steps=3, faces=None, passes=0, augmentat
 
 
 def objective_of(network, **settings) -> UnrolledObjective:
-    unroll = UnrollConfig(**({"steps": 3, "collision_passes": 0} | settings))
+    unroll = UnrollConfig(**({"steps": 3, "position": 0.0, "collision_passes": 0} | settings))
     return UnrolledObjective(network, LossConfig(), 0.0, "float32", unroll)
 
 
