@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from . import inside
+from . import inside, nearest_face
 from ._torch import as_warp, expect, torch_stream
 from .closest import Bodies, query_bodies
 from .inside import loop_size_kernel
@@ -74,7 +74,8 @@ class BodyMeshes:
         self._vertices = vertices.detach().clone(memory_format=torch.contiguous_format)
         self._faces = faces.detach().clone(memory_format=torch.contiguous_format)
         local = self._faces - first_vertex[:, None]
-        caps = inside.caps_of(self._faces.cpu().numpy(), len(vertices), starts)
+        host = self._faces.cpu().numpy()
+        caps = inside.caps_of(host, len(vertices), starts)
         many = [int(caps.loops[b] - caps.loops[a]) > inside.MOST_CAPS for a, b in pairwise(caps.bodies.tolist())]
         self._meshes: list[wp.Mesh] = []
         with torch_stream(vertices.device):
@@ -102,6 +103,7 @@ class BodyMeshes:
             "face_offsets": (self.face_offsets, wp.int32),
             "faces": (self._faces, wp.vec3i),
             "vertices": (self._vertices, wp.vec3),
+            "rings": (integers(nearest_face.rings_of(host, face_starts)), wp.int32),
             "scattered": (integers(many), wp.int32),
             "loop_offsets": (integers(caps.bodies), wp.int32),
             "loops": (integers(caps.loops), wp.int32),

@@ -3,7 +3,8 @@
 Manifold-aware transformers, section 4.2 (s_i) and supplement equation 2; formulas in sdf.py. The closest point comes
 from Warp's hierarchy of the body's faces, the sign from inside.py. Nothing of earlier frames is used: a perfect guess
 of the distance would shorten the search by a tenth, and an answer would depend on more than was asked. What shortens
-it is to ask for less: contacts need no point that is further outside than they reach (`within`).
+it is to ask for less: contacts need no point that is further outside than they reach (`within`). Which face is named
+where several are equally near is decided in nearest_face.py.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import warp as wp
 from ._operator import allocate
 from ._torch import as_argument, torch_stream
 from .inside import is_inside
+from .nearest_face import named_face, nearest_on_part, nearest_part
 
 MAX_DISTANCE = wp.constant(1.0e18)  # farther than anything; its square still fits a float32
 # Bodies in pieces: distance, in radii, from which a group of faces is summed as one. On closed bodies 1, 2 and 3 give
@@ -35,6 +37,7 @@ class Bodies:
     face_offsets: wp.array[wp.int32]
     faces: wp.array[wp.vec3i]  # packed vertex indices
     vertices: wp.array[wp.vec3]
+    rings: wp.array2d[wp.int32]  # faces that share a corner or an edge, see nearest_face.rings_of
     scattered: wp.array[wp.int32]  # whether a body has too many holes to be closed by caps
     loop_offsets: wp.array[wp.int32]  # loops of each body, see inside.Caps
     loops: wp.array[wp.int32]
@@ -105,7 +108,14 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
                     v = deep.v
     if face < 0:
         return wp.where(reach < MAX_DISTANCE, BEYOND, NOTHING), sign, nowhere, wp.vec3d(nowhere)
-    return face, sign, wp.vec3(u, v, 1.0 - u - v), position_on(mesh, face, u, v)
+    weights = wp.vec3(u, v, 1.0 - u - v)
+    position = position_on(mesh, face, u, v)
+    named = named_face(mesh, bodies.rings, bodies.face_offsets[b], face, point)
+    if named != face:  # the same position, or else the nearest to it, on another face
+        part, _around = nearest_part(mesh, named, position)
+        coordinates, _distance = nearest_on_part(mesh, named, part, position)
+        weights = wp.vec3(coordinates)
+    return named, sign, weights, position
 
 
 @wp.kernel(enable_backward=False)

@@ -1,0 +1,189 @@
+"""Which face of a body is named nearest, where several are equally near.
+
+Manifold-aware transformers, section 4.2 (the nearest body face of d_i). Around a person, the nearest point of the body
+lies on an edge or a vertex for every fourth point: over a convex edge, the faces on both sides are equally near. Which
+of them a search meets first is a matter of its tree and of rounding, but the network is told how the named face moves.
+So the rule is:
+
+    the nearest point is inside a face     that face
+    on an edge                             the smallest index of the faces that share the edge
+    at a vertex                            the smallest index of the faces around the vertex
+
+No tolerance is involved. On which part of a face its nearest point lies is told by the signs of dot products in
+float64, which are the same for all faces that share the part. But a search in float32 takes faces for equally near
+whose nearest points are up to some 0.1 mm apart: distances are flat around their minimum, and 1e-7 m of distance is so
+much along the surface. Close to where two parts meet it may come back with the lesser one. Hence the faces around the
+part that was found are asked too, and where one of them is nearer, the rule is applied there.
+
+What is left are points as far from two places of the body that do not touch, between the legs for instance. There the
+nearest point itself jumps, and within rounding (1e-7 m) of the jump either answer is right: it is harmless to what is
+asked once, and no rule could make it repeatable.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+PARTS = wp.constant(6)  # of a face that others may share: corners 0, 1, 2, and edges 3, 4, 5 that begin there
+INSIDE = wp.constant(6)
+NO_PART = wp.constant(-1)
+CLOSE = wp.constant(wp.float64(0.02))  # barycentric, 0.4 mm of a usual edge: where neighbours are asked to be sure
+SLIVER = wp.constant(wp.float64(1.0e-12))  # (2 area / sum of squared edges)²; Warp's searches skip what is thinner
+
+
+def rings_of(faces: np.ndarray, face_starts: list[int]) -> np.ndarray:
+    """For each corner and each edge of each face, the next face that has it too, all round.
+
+    Args:
+        faces: Packed vertex indices, [G, 3]; an edge may have any number of faces, in any orientation.
+        face_starts: Where the faces of each body begin, and the end, [B + 1].
+
+    Returns:
+        int32 [G, 6], columns as parts are numbered: 6 times the next face (counted within its body), plus the number
+        the part has there. The last face leads to the first, an only one to itself.
+    """
+    start = faces.astype(np.int64)
+    end = start[:, [1, 2, 0]]
+    count = int(start.max(initial=0)) + 1
+    edges = (1 + np.minimum(start, end)) * count + np.maximum(start, end)  # not among the vertices
+    keys = np.concatenate([start, edges], axis=1).ravel()
+    order = np.argsort(keys, kind="stable")
+    is_last = np.append(np.diff(keys[order]) != 0, True)
+    is_first = np.append(True, is_last[:-1])
+    following = np.append(order[1:], 0)
+    following[is_last] = order[is_first]
+    rings = np.empty((len(faces), 6), np.int64)
+    rings.ravel()[order] = following
+    first_face = np.repeat(face_starts[:-1], np.diff(face_starts))
+    return (rings - 6 * first_face[:, None]).astype(np.int32)
+
+
+@wp.func
+def corners_of(mesh: wp.uint64, face: int):
+    """The corners of a face in float64."""
+    body = wp.mesh_get(mesh)
+    a = wp.vec3d(body.points[body.indices[3 * face]])
+    b = wp.vec3d(body.points[body.indices[3 * face + 1]])
+    c = wp.vec3d(body.points[body.indices[3 * face + 2]])
+    return a, b, c
+
+
+@wp.func
+def along_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
+    """How far a point is beyond the start and beyond the end of each edge of a triangle, times the edge's length."""
+    ab, bc, ca = b - a, c - b, a - c
+    pa, pb, pc = point - a, point - b, point - c
+    after = wp.vec3d(wp.dot(pa, ab), wp.dot(pb, bc), wp.dot(pc, ca))
+    beyond = wp.vec3d(wp.dot(pb, ab), wp.dot(pc, bc), wp.dot(pa, ca))
+    return after, beyond
+
+
+@wp.func
+def inward_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, after: wp.vec3d, beyond: wp.vec3d):
+    """n · (e × p) = |e|² (f · q) - (e · f) (e · q), p and q from the starts of edge e and the next edge f, for each e.
+
+    Positive on the inner side of the edge. The three add up to n², n being the cross product of two edges.
+    """
+    ab, bc, ca = b - a, c - b, a - c
+    return wp.vec3d(
+        wp.dot(ab, ab) * after[1] - wp.dot(ab, bc) * beyond[0],
+        wp.dot(bc, bc) * after[2] - wp.dot(bc, ca) * beyond[1],
+        wp.dot(ca, ca) * after[0] - wp.dot(ca, ab) * beyond[2],
+    )
+
+
+@wp.func
+def nearest_part(mesh: wp.uint64, face: int, point: wp.vec3d):
+    """On which part of a face it is nearest to a point, and the part whose faces may be nearer after all.
+
+    Returns:
+        Part; NO_PART if the face is a sliver. The same again, or the edge or corner that is close to the nearest point.
+    """
+    a, b, c = corners_of(mesh, face)
+    after, beyond = along_edges(a, b, c, point)
+    inward = inward_of_edges(a, b, c, after, beyond)
+    ab, bc, ca = b - a, c - b, a - c
+    area = wp.dot(ab, ab) * wp.dot(bc, bc) - wp.dot(ab, bc) * wp.dot(ab, bc)
+    size = wp.dot(ab, ab) + wp.dot(bc, bc) + wp.dot(ca, ca)
+    if not area > SLIVER * size * size:
+        return NO_PART, NO_PART
+    part = wp.int32(INSIDE)
+    around = wp.int32(INSIDE)
+    zero = wp.float64(0.0)
+    if wp.min(inward) > zero:
+        for k in range(3):
+            if inward[k] < CLOSE * area:
+                around = 3 + k
+        return part, around
+    for k in range(3):
+        if after[k] <= zero and beyond[(k + 2) % 3] >= zero:
+            part = k
+            around = k
+        elif inward[k] <= zero and after[k] > zero and beyond[k] < zero:
+            part = 3 + k
+            around = 3 + k
+            if after[k] < -CLOSE * beyond[k]:
+                around = k
+            elif -beyond[k] < CLOSE * after[k]:
+                around = (k + 1) % 3
+    return part, around
+
+
+@wp.func
+def nearest_on_part(mesh: wp.uint64, face: int, part: int, point: wp.vec3d):
+    """Barycentric coordinates of the point nearest to a point on that part of a face, and its squared distance [m²]."""
+    a, b, c = corners_of(mesh, face)
+    after, beyond = along_edges(a, b, c, point)
+    inward = inward_of_edges(a, b, c, after, beyond)
+    weights = wp.vec3d(inward[1], inward[2], inward[0]) / (inward[0] + inward[1] + inward[2])
+    for k in range(3):
+        if part == k:
+            weights = wp.vec3d()
+            weights[k] = wp.float64(1.0)
+        elif part == 3 + k:
+            t = after[k] / (after[k] - beyond[k])
+            weights = wp.vec3d()
+            weights[k] = wp.float64(1.0) - t
+            weights[(k + 1) % 3] = t
+    return weights, wp.length_sq(weights[0] * a + weights[1] * b + weights[2] * c - point)
+
+
+@wp.func
+def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_face: int, face: int, point: wp.vec3):
+    """The face that the rule above names, given one that a search found.
+
+    Args:
+        mesh: The body.
+        rings: From `rings_of`.
+        first_face: Of the body, in `rings`.
+        face: Found, counted within the body.
+        point: Position [m].
+    """
+    p = wp.vec3d(point)
+    nearest = wp.int32(face)
+    part, around = nearest_part(mesh, nearest, p)
+    named = wp.int32(face)
+    begin = wp.int32(-1)
+    # It ends: rounds that change anything come nearer.
+    while around >= 0 and around < PARTS and begin != PARTS * nearest + around:
+        begin = PARTS * nearest + around
+        named = nearest
+        at = rings[first_face + nearest, around]
+        while at != begin:
+            other = at // PARTS
+            shared = at - PARTS * other
+            theirs, _around = nearest_part(mesh, other, p)
+            if theirs != NO_PART:
+                named = wp.min(named, other)
+                if theirs != shared:
+                    _w, distance = nearest_on_part(mesh, other, theirs, p)
+                    _v, least = nearest_on_part(mesh, nearest, part, p)
+                    if distance < least:
+                        nearest = other
+                        part = theirs
+            at = rings[first_face + other, shared]
+        around = part
+    if part == INSIDE:
+        named = nearest
+    return named
