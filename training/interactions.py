@@ -32,7 +32,7 @@ from warpgarment.kernels.deformation import face_centroids
 from warpgarment.kernels.features import BodyInteraction, body_interaction
 from warpgarment.kernels.sdf import BodyMeshes
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
 WIDTH = 16
 COLUMNS = {"closest": slice(0, 3), "sign": 3, "deformation": slice(4, 13), "velocity": slice(13, 16)}
 _SOURCES = (
