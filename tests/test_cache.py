@@ -1,6 +1,9 @@
 """If these failed, a stale or damaged file would pass for a garment's distances, or two processes would spoil one."""
 
+import os
+import tempfile
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,6 +36,13 @@ class Counted:
 def ask(compute, *inputs):
     found = cache.remembered("kind-1", [np.arange(4), *inputs], EXPECTED, compute)
     np.testing.assert_array_equal(found["a"], [[0, 1], [2, 3], [4, 5]])
+
+
+def test_tests_have_a_cache_of_their_own():
+    """Garments of tests would fill the cache of whoever runs them."""
+    assert cache.cache_folder().parent == Path(tempfile.gettempdir())
+    assert cache.cache_folder().is_dir()
+    assert os.environ["WARPGARMENT_CACHE"] == str(cache.cache_folder())  # what processes inherit
 
 
 def test_hit_miss_and_off(folder, monkeypatch):
