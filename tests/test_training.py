@@ -144,13 +144,13 @@ def test_bfloat16_keeps_losses_and_weights_in_float32(data, tmp_path, monkeypatc
         return losses
 
     monkeypatch.setattr(Objective, "forward", watch)
-    settings = {"steps": 2, "pushforward": QUIET, "validate_sequences": 0}
+    settings = {"steps": 4, "pushforward": QUIET, "validate_sequences": 0}  # the first steps are hardly any
     for precision in ("float32", "bfloat16"):
         train.train(config_for(data, tmp_path / precision, precision=precision, **settings))
     assert set(seen) == {(torch.float32, torch.float32)}
     exact, half = (losses_of(tmp_path / p) for p in ("float32", "bfloat16"))
-    assert exact[2] != half[2]
-    assert half[2] == pytest.approx(exact[2], rel=0.03)
+    assert exact[4] != half[4]
+    assert half == pytest.approx(exact, rel=0.03)
 
 
 def test_compiled_run_gives_the_same_losses(data, tmp_path, monkeypatch):
