@@ -16,8 +16,8 @@ where there is neither (collision_operator.py).
 | symbol | code | what |
 | --- | --- | --- |
 | Ṽ, V | `vertices`, result | garment before and after |
-| U_i | `closest` | closest point of the body surface |
-| n_i | `normal` | sign (Ṽ_i - U_i) / |Ṽ_i - U_i|, or the body face's normal right at the surface; zero outside C |
+| U_i | `closest` | closest point of the body surface; where that is the far side (contacts.py), the point of entry |
+| n_i | `normal` | sign (Ṽ_i - U_i) / |Ṽ_i - U_i|, or the face's normal at the surface and at entry; zero outside C |
 | ε | `epsilon` | distance kept from the body |
 | L | `laplacian.cotangent_laplacian` | of the rest mesh, unitless |
 
@@ -133,6 +133,7 @@ class CollisionSolver:
         body_of_vertex: torch.Tensor | None = None,
         *,
         epsilon: float | torch.Tensor = 0.004,
+        origin: torch.Tensor | None = None,
         passes: int = 1,
         tolerance: float = TOLERANCE,
     ) -> torch.Tensor:
@@ -145,6 +146,9 @@ class CollisionSolver:
             bodies: The bodies in the frame of `vertices`.
             body_of_vertex: Body of each vertex, int32 [V]; None where there is one body.
             epsilon: Distance kept from the body [m]: a number, or float32 [V] with one for each vertex.
+            origin: Where each vertex comes from [m], float32 [V,3], in the frame of `bodies`; NaN where that is not
+                known. A vertex past the middle of a limb is led back to the side where it went in. None: all leave by
+                the nearest way.
             passes: How often detection and solve are done, each from the result of the one before.
             tolerance: Where the iteration stops: error in the energy norm [m]. The default keeps every vertex within
                 0.02 mm of the exact minimiser.
@@ -164,6 +168,8 @@ class CollisionSolver:
             expect("epsilon", epsilon, (self.vertex_count,), device=self.device)
         elif not epsilon >= 0:
             raise ValueError(f"epsilon must not be negative, got {epsilon}")
+        if origin is not None:
+            expect("origin", origin, (self.vertex_count, 3), device=self.device)
         if not tolerance > 0:
             raise ValueError(f"tolerance must be positive, got {tolerance}")
         if passes < 1:
@@ -171,7 +177,15 @@ class CollisionSolver:
         limit = torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
         for number in range(passes):
             query = bodies.query(vertices.detach(), body_of_vertex, within=epsilon)
-            closest, normal = contacts(vertices, query.distance, query.face, bodies, math.inf if each else epsilon)
+            closest, normal = contacts(
+                vertices,
+                query.distance,
+                query.face,
+                bodies,
+                math.inf if each else epsilon,
+                body_of_vertex=body_of_vertex,
+                origin=origin,
+            )
             if isinstance(epsilon, torch.Tensor):  # n.(V - U) - e = n.(V - (U + e n)), so the solver's epsilon is zero
                 normal = torch.where((query.distance < epsilon)[:, None], normal, 0.0)
                 closest = closest + epsilon[:, None] * normal

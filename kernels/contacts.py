@@ -1,4 +1,9 @@
-"""The contacts of a garment with a body: closest points and outward directions in float64. Symbols: collision.py."""
+"""The contacts of a garment with a body: closest points and outward directions in float64. Symbols: collision.py.
+
+The nearest way out of a limb is the wrong one for a vertex that is past its middle: it leads through the limb. Where it
+is known from where a vertex comes, the way from there to the vertex is followed to the first face, and if the nearest
+surface looks the other way than that face, the contact is with that face.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ from . import cg
 from ._operator import allocate
 from ._torch import torch_stream
 from .body_meshes import BodyMeshes
+from .closest import Bodies
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
 """Below this distance [m] the direction from the closest point is noise, and the face's normal is taken."""
@@ -36,15 +42,29 @@ def closest_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> w
     return best
 
 
+@wp.func
+def entered(bodies: Bodies, b: int, origin: wp.vec3, end: wp.vec3) -> int:
+    """The face through which a way goes into a body, packed; -1 if it meets none first or comes out of one."""
+    way = end - origin
+    length = wp.length(way)
+    if b < 0 or b >= bodies.meshes.shape[0] or not (length > 0.0 and wp.isfinite(length)):
+        return -1
+    hit = wp.mesh_query_ray(bodies.meshes[b], origin, way / length, length)
+    if not hit.result or wp.dot(hit.normal, way) >= 0.0:
+        return -1
+    return hit.face + bodies.face_offsets[b]
+
+
 @wp.kernel(enable_backward=False)
 def find_contacts(
     # Body:
-    body_vertices: wp.array[wp.vec3],
-    body_faces: wp.array2d[wp.int32],
+    bodies: Bodies,
     # In:
     vertices: wp.array[wp.vec3],
     distance: wp.array[wp.float32],
     face: wp.array[wp.int32],
+    body_of_vertex: wp.array[wp.int32],
+    origin: wp.array[wp.vec3],  # or nothing
     epsilon: wp.float64,
     # Out:
     closest: wp.array[wp.vec3d],
@@ -59,10 +79,10 @@ def find_contacts(
     u = wp.vec3d()
     if wp.float64(distance[i]) < epsilon:
         p = wp.vec3d(vertices[i])
-        j = face[i]
-        a = wp.vec3d(body_vertices[body_faces[j, 0]])
-        b = wp.vec3d(body_vertices[body_faces[j, 1]])
-        c = wp.vec3d(body_vertices[body_faces[j, 2]])
+        corner = bodies.faces[face[i]]
+        a = wp.vec3d(bodies.vertices[corner[0]])
+        b = wp.vec3d(bodies.vertices[corner[1]])
+        c = wp.vec3d(bodies.vertices[corner[2]])
         u = closest_on_triangle(p, a, b, c)
         length = wp.length(p - u)
         if length > AT_SURFACE:
@@ -71,6 +91,18 @@ def find_contacts(
                 n = -n
         else:
             n = wp.normalize(wp.cross(b - a, c - a))
+        if distance[i] < 0.0 and origin.shape[0] > 0:
+            entry = entered(bodies, body_of_vertex[i], origin[i], vertices[i])
+            if entry >= 0:
+                corner = bodies.faces[entry]
+                a = wp.vec3d(bodies.vertices[corner[0]])
+                outward = wp.normalize(
+                    wp.cross(wp.vec3d(bodies.vertices[corner[1]]) - a, wp.vec3d(bodies.vertices[corner[2]]) - a)
+                )
+                if wp.dot(outward, n) < wp.float64(0.0):
+                    o = wp.vec3d(origin[i])
+                    u = o + (p - o) * (wp.dot(outward, a - o) / wp.dot(outward, p - o))
+                    n = outward
     closest[i] = u
     normal[i] = n
 
@@ -95,7 +127,14 @@ def contact_gap(
 
 
 def contacts(
-    vertices: torch.Tensor, distance: torch.Tensor, face: torch.Tensor, bodies: BodyMeshes, epsilon: float
+    vertices: torch.Tensor,
+    distance: torch.Tensor,
+    face: torch.Tensor,
+    bodies: BodyMeshes,
+    epsilon: float,
+    *,
+    body_of_vertex: torch.Tensor | None = None,
+    origin: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The set C: what a body query found closer than epsilon.
 
@@ -105,22 +144,29 @@ def contacts(
         face: Nearest body face, int32 [V].
         bodies: The bodies in the frame of `vertices`.
         epsilon: Distance kept from the body [m].
+        body_of_vertex: Body of each vertex, int32 [V]; None where there is one body.
+        origin: Where each vertex comes from [m], float32 [V,3], outside the body or NaN: vertices inside are led back
+            to the side where they went in. None: they leave by the nearest way.
 
     Returns:
-        Closest points [m] and outward directions, float64 [V,3]; zero at vertices that are not in C.
+        Closest points, or points of entry, [m] and outward directions, float64 [V,3]; zero at vertices that are not in
+        C.
     """
-    vertices, body_vertices, body_faces = vertices.detach().contiguous(), bodies.vertices, bodies.faces
+    vertices = vertices.detach().contiguous()
+    body_of_vertex = bodies.body_of("body_of_vertex", body_of_vertex, len(vertices))
+    origin = vertices.new_empty((0, 3)) if origin is None else origin.detach().contiguous()
     closest, normal = allocate((2, len(vertices), 3), torch.float64, vertices.device)
     with torch_stream(vertices.device) as device:
         wp.launch(
             find_contacts,
             dim=len(vertices),
             inputs=[
-                cg.view(body_vertices, wp.vec3),
-                cg.view(body_faces, wp.int32),
+                bodies.model,
                 cg.view(vertices, wp.vec3),
                 cg.view(distance, wp.float32),
                 cg.view(face, wp.int32),
+                cg.view(body_of_vertex, wp.int32),
+                cg.view(origin, wp.vec3),
                 float(epsilon),
                 cg.view(closest, wp.vec3d),
                 cg.view(normal, wp.vec3d),

@@ -130,7 +130,7 @@ class UnrolledObjective(nn.Module):
                 vertices, compose(output, newest, residual=config.residual), features, body
             )
             if self.unroll.collision_passes:
-                solved = scene.push_out(solved, body, finite)[0]
+                solved = scene.push_out(solved, body, finite, scene.carried(vertices, features))[0]
             yield terms, solved, recorded
             if not last:
                 velocity = scene.components_mean(solved) - scene.components_mean(vertices)

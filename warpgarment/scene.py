@@ -17,6 +17,7 @@ from warpgarment.batch import PackedBodies, PackedGarments, padded_views
 from warpgarment.errors import MeshError
 from warpgarment.frame_graph import GraphedFrames
 from warpgarment.garment import Garment
+from warpgarment.kernels.carried import carried, face_at_each_vertex
 from warpgarment.kernels.collision import CollisionSolver
 from warpgarment.kernels.deformation import inverse_rest_frames
 from warpgarment.kernels.face_means import FaceMeans
@@ -92,6 +93,7 @@ class Scene:
         self.placed: torch.Tensor | None = body_vertices  # what the trees were last moved to
         self.refuse_far(first_vertices)
 
+        self._face_of_vertex = face_at_each_vertex(packed.faces, vertex_count)
         self.views = padded_views(packed, garments, network.config, face_splits)
         pinned = len(packed.pins) > 0
         self.poisson = PoissonSolver(packed.rest_vertices, packed.faces, pins=packed.pins if pinned else None)
@@ -214,8 +216,13 @@ class Scene:
                 solved = solved + self.mean_response * missing
         return self.keep_finite(solved, vertices, finite)
 
+    def carried(self, vertices: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """Where the vertices of a frame [V,3] with these features [F,34] would be had they moved with the body."""
+        with self.timings("collision"):
+            return carried(vertices, self.packed.faces, self._face_of_vertex, features)
+
     def push_out(
-        self, vertices: torch.Tensor, next_body: torch.Tensor, finite: torch.Tensor
+        self, vertices: torch.Tensor, next_body: torch.Tensor, finite: torch.Tensor, origin: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Step 5: refines collisions, again for garments that are still deep and while it helps them.
 
@@ -226,6 +233,8 @@ class Scene:
             vertices: Positions [m], shape [V,3].
             next_body: Bodies in the next frame, shape [U,3].
             finite: Which garments are still simulated, shape [B].
+            origin: From where the vertices come, see `carried`, shape [V,3]; None: all leave the body by the nearest
+                way.
 
         Returns:
             Positions [V,3], finite [B], depth of each garment's deepest vertex [m] [B], and what the solver says of all
@@ -236,7 +245,7 @@ class Scene:
             pending, depth, on_body = finite, None, self.body_of_vertex
             solves = vertices.new_zeros(3, dtype=torch.float64)
             for _ in range(self.collision_passes):
-                refined = self.collision.refine(vertices, bodies, on_body, epsilon=self.epsilon)
+                refined = self.collision.refine(vertices, bodies, on_body, epsilon=self.epsilon, origin=origin)
                 solves = _together(solves, self.collision.summary())
                 mine = pending[self.packed.garment_of_vertex.long()]
                 refined = torch.where(mine[:, None], refined, vertices)

@@ -48,3 +48,25 @@ def refine(
     left = sp.kron(matrix, sp.eye(3)) + constraint.T @ constraint
     right = (matrix @ vertices).ravel() + constraint.T @ target
     return spsolve(left.tocsc(), right).reshape(-1, 3)
+
+
+def entry(origin: np.ndarray, end: np.ndarray, body_vertices: np.ndarray, body_faces: np.ndarray):
+    """Where ways first meet a body: points and outward normals, NaN where they meet none or come out of it.
+
+    Every way against every face: the signed volumes of the tetrahedra that it spans with the face's edges.
+    """
+    a, b, c = (body_vertices[body_faces[:, k]].astype(np.float64) for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points, found = np.full(origin.shape, np.nan), np.full(origin.shape, np.nan)
+    for i, (o, p) in enumerate(zip(origin.astype(np.float64), end.astype(np.float64), strict=True)):
+        along = normals @ (p - o)
+        with np.errstate(all="ignore"):
+            t = ((a - o) * normals).sum(1) / along
+        sides = np.stack([np.cross(x - o, y - o) @ (p - o) for x, y in ((a, b), (b, c), (c, a))])
+        met = ((sides > 0).all(0) | (sides < 0).all(0)) & (t >= 0) & (t <= 1)
+        if met.any():
+            first = np.flatnonzero(met)[np.argmin(t[met])]
+            if along[first] < 0:
+                points[i], found[i] = o + t[first] * (p - o), normals[first]
+    return points, found
