@@ -14,6 +14,8 @@ from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
 from warpgarment.training.mesh_cutting import without_short_edges
 
+MOST_REMESHED = 100_000  # faces; remeshing further leaves faces without area, so each face is cut into four instead
+
 
 @dataclass(frozen=True)
 class Dressed:
@@ -31,10 +33,14 @@ def remeshed(faces: int, name: str = "dress") -> tuple[Garment, np.ndarray, np.n
     """The bundled garment with about `faces` faces; the old face and the barycentric coordinates of each new vertex."""
     item = demo.assets().garments[name]
     rest, old = item.garment.vertices.astype(np.float64), item.garment.faces.astype(np.int64)
-    area = 0.5 * np.asarray(igl.doublearea(rest, old)).sum()
-    edge = float(np.sqrt(area * 4.0 / (np.sqrt(3.0) * faces)))
-    vertices, triangles = remesh_botsch(rest, old.astype(np.int32), i=10, h=edge, project=True)
-    vertices, triangles = without_short_edges(vertices, triangles, 0.3 * edge)
+    if faces > MOST_REMESHED:
+        coarse = remeshed(faces // 4, name)[0]
+        vertices, triangles = igl.upsample(coarse.vertices.astype(np.float64), coarse.faces.astype(np.int64))
+    else:
+        area = 0.5 * np.asarray(igl.doublearea(rest, old)).sum()
+        edge = float(np.sqrt(area * 4.0 / (np.sqrt(3.0) * faces)))
+        vertices, triangles = remesh_botsch(rest, old.astype(np.int32), i=10, h=edge, project=True)
+        vertices, triangles = without_short_edges(vertices, triangles, 0.3 * edge)
     _, nearest, closest = igl.point_mesh_squared_distance(vertices, rest, old)
     corners = [rest[old[nearest, k]] for k in range(3)]
     weights = np.asarray(igl.barycentric_coordinates(closest, *corners)).reshape(-1, 3)

@@ -37,8 +37,10 @@ def right_hand_side(
     a = wp.tid()
     v = initial[a]
     g = wp.vec3d()
-    for e in range(corner_start[a], corner_start[a + 1]):
-        i = corners[e] // 3
+    e = corner_start[a]
+    last = corner_start[a + 1]
+    while e < last:
+        i = corners[e] / 3
         k = corners[e] - 3 * i
         j = wp.where(k == 2, 0, k + 1)
         l = wp.where(k == 0, 2, k - 1)
@@ -46,6 +48,7 @@ def right_hand_side(
         w = half_cotangent[i]  # indexed by the corner opposite to the edge
         g += wp.mat33d(phi[i]) * corner_edge[e]
         g -= w[l] * (v - initial[f[j]]) + w[j] * (v - initial[f[l]])
+        e += 1
     pin = pin_of_vertex[a]
     if pin >= 0:
         g += pin_stiffness[a] * (wp.vec3d(pin_target[pin]) - v)

@@ -51,10 +51,13 @@ def eliminate(
     x1 = x[place + 1] - t[1, 0] * x0
     x2 = x[place + 2] - t[2, 0] * x0 - t[2, 1] * x1
     x3 = x[place + 3] - t[3, 0] * x0 - t[3, 1] * x1 - t[3, 2] * x2
-    for e in range(pointer[panel], pointer[panel + 1]):
+    e = pointer[panel]
+    last = pointer[panel + 1]
+    while e < last:
         j = first + row[e]
         v = value[e]
         x[j] = (x[j] - v[0] * x0 - v[1] * x1) - (v[2] * x2 + v[3] * x3)
+        e += 1
     d = pivot[panel]
     x[place] = d[0] * x0
     x[place + 1] = d[1] * x1
@@ -78,13 +81,16 @@ def substitute_back(
     x1 = x[place + 1]
     x2 = x[place + 2]
     x3 = x[place + 3]
-    for e in range(pointer[panel], pointer[panel + 1]):
+    e = pointer[panel]
+    last = pointer[panel + 1]
+    while e < last:
         s = x[first + row[e]]
         v = value[e]
         x0 -= v[0] * s
         x1 -= v[1] * s
         x2 -= v[2] * s
         x3 -= v[3] * s
+        e += 1
     t = triangle[panel]
     x2 -= t[3, 2] * x3
     x1 -= t[2, 1] * x2 + t[3, 1] * x3
