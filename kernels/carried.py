@@ -1,10 +1,12 @@
 r"""Where vertices would be had they moved with the body: where they come from, as seen from the body.
 
-    V' = U + q̄ + D (V - U),    U = c + |d| v̄
+    V' = U + q̄ + D (V - U + l n),    U = c + |d| v̄,    n = -sign(d) v̄
 
 with c the centroid of one face at the vertex and d, v̄, D, q̄ of features.py what that face knows of the nearest body
-face: U is the nearest body point, D and q̄ how it will move. No query is needed, as the features of a frame have been
-asked for already. Collision refinement follows a vertex from V' to its predicted position to find where it went in.
+face: U is the nearest body point, n points out of the body there, D and q̄ are how it will move. No query is needed, as
+the features of a frame have been asked for already. Collision refinement follows a vertex from V' to its predicted
+position to find where it went in. A vertex that was left a little inside is lifted out, by l, to begin with: from
+inside, the first surface on the way would be the far one.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ from ._operator import allocate
 from ._torch import as_argument, expect, torch_stream
 from .features import FEATURES, LAYOUT
 
+LIFT = wp.constant(0.005)
+"""l [m], a few times the depth at which refinement leaves a vertex (`scene.SHALLOW`)."""
 DISTANCE = wp.constant(LAYOUT["signed_distance"].start)
 DIRECTION = wp.constant(LAYOUT["direction_to_body"].start)
 DEFORMATION = wp.constant(LAYOUT["body_deformation"].start)
@@ -45,8 +49,10 @@ def carried_kernel(
         return
     corner = faces[f]
     centroid = (vertices[corner[0]] + vertices[corner[1]] + vertices[corner[2]]) / 3.0
-    point = centroid + wp.abs(features[f, DISTANCE]) * three(features, f, DIRECTION)
-    away = vertices[i] - point
+    distance = features[f, DISTANCE]
+    direction = three(features, f, DIRECTION)
+    point = centroid + wp.abs(distance) * direction
+    away = vertices[i] - point - wp.sign(distance) * LIFT * direction
     turned = wp.vec3(
         wp.dot(three(features, f, DEFORMATION), away),
         wp.dot(three(features, f, DEFORMATION + 3), away),
@@ -66,7 +72,7 @@ def face_at_each_vertex(faces: torch.Tensor, vertex_count: int) -> torch.Tensor:
 def carried(
     vertices: torch.Tensor, faces: torch.Tensor, face_of_vertex: torch.Tensor, features: torch.Tensor
 ) -> torch.Tensor:
-    """Moves vertices of frame t with the body to frame t+1, without gradients.
+    """Moves vertices of frame t, lifted by `LIFT`, with the body to frame t+1; without gradients.
 
     Args:
         vertices: Positions in frame t [m], float32 [V,3].
