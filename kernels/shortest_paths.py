@@ -283,7 +283,7 @@ class Paths:
 
         for block in blocks[:1]:  # alone: it may have to compile the kernel
             run(block)
-        with ThreadPoolExecutor(threads or _cores()) as pool:  # launches release the interpreter's lock
+        with ThreadPoolExecutor(threads or usable_cores()) as pool:  # launches release the interpreter's lock
             list(pool.map(run, blocks[1:]))
         return found
 
@@ -316,6 +316,6 @@ def _landmarks(graph: csr_matrix) -> np.ndarray:
     return np.where(finite, points, 2.0 * points[finite].max())
 
 
-def _cores() -> int:
+def usable_cores() -> int:
     """Cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
