@@ -19,7 +19,7 @@ from ._torch import as_argument, expect, torch_stream
 from .features import FEATURES, LAYOUT
 
 LIFT = wp.constant(0.005)
-"""l [m], a few times the depth at which refinement leaves a vertex (`scene.SHALLOW`)."""
+"""l [m], more than the depth at which refinement leaves all but a few vertices."""
 DISTANCE = wp.constant(LAYOUT["signed_distance"].start)
 DIRECTION = wp.constant(LAYOUT["direction_to_body"].start)
 DEFORMATION = wp.constant(LAYOUT["body_deformation"].start)

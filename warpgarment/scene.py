@@ -35,7 +35,7 @@ SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the 
 CLOSEST = 0.004  # metres between a vertex and the body, at least
 CLEARANCE_PER_EDGE = 0.2  # ... and as a share of the mean edge length
 PINNED_MEAN = 0.9  # share of the way that q moves a pinned garment from where its pins alone would hold it
-SHALLOW = 1e-3  # metres: collisions are repeated while a vertex is deeper
+SHALLOW = 1e-4  # metres: collisions are repeated while a vertex is deeper
 WORTHWHILE = 0.9  # ... and while a pass leaves at most this share of the depth before it
 
 
