@@ -313,6 +313,8 @@ def test_not_a_number_stays_visible():
         ({"body_of_vertex": torch.zeros(4, dtype=torch.int64)}, TypeError, "body_of_vertex must be int32"),
         ({"epsilon": -1.0}, ValueError, "epsilon"),
         ({"epsilon": float("nan")}, ValueError, "epsilon"),
+        ({"origin": torch.zeros(3, 3)}, ValueError, "origin must have shape"),
+        ({"origin": torch.zeros(4, 3, dtype=torch.float64)}, TypeError, "origin must be float32"),
         ({"tolerance": 0.0}, ValueError, "tolerance"),
         ({"passes": 0}, ValueError, "passes"),
     ],
