@@ -16,7 +16,7 @@ where there is neither (collision_operator.py).
 | symbol | code | what |
 | --- | --- | --- |
 | Ṽ, V | `vertices`, result | garment before and after |
-| U_i | `closest` | closest point of the body surface; where that is the far side (contacts.py), the point of entry |
+| U_i | `closest` | closest point of the body surface or, where that is the far side, of the face of entry's plane |
 | n_i | `normal` | sign (Ṽ_i - U_i) / |Ṽ_i - U_i|, or the face's normal at the surface and at entry; zero outside C |
 | ε | `epsilon` | distance kept from the body |
 | L | `laplacian.cotangent_laplacian` | of the rest mesh, unitless |

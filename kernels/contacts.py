@@ -100,8 +100,7 @@ def find_contacts(
                     wp.cross(wp.vec3d(bodies.vertices[corner[1]]) - a, wp.vec3d(bodies.vertices[corner[2]]) - a)
                 )
                 if wp.dot(outward, n) < wp.float64(0.0):
-                    o = wp.vec3d(origin[i])
-                    u = o + (p - o) * (wp.dot(outward, a - o) / wp.dot(outward, p - o))
+                    u = p - wp.dot(outward, p - a) * outward  # any point of its plane does
                     n = outward
     closest[i] = u
     normal[i] = n
@@ -149,8 +148,8 @@ def contacts(
             to the side where they went in. None: they leave by the nearest way.
 
     Returns:
-        Closest points, or points of entry, [m] and outward directions, float64 [V,3]; zero at vertices that are not in
-        C.
+        Closest points, for those led back of the plane of that face, [m] and outward directions, float64 [V,3]; zero at
+        vertices that are not in C.
     """
     vertices = vertices.detach().contiguous()
     body_of_vertex = bodies.body_of("body_of_vertex", body_of_vertex, len(vertices))

@@ -65,7 +65,9 @@ def test_vertices_past_the_middle_are_led_back_to_where_they_went_in():
         assert np.array_equal(normal[mine][~far], outward[mine][~far])
         assert np.array_equal(closest[mine][~far], nearest[mine][~far])
         np.testing.assert_allclose(normal[mine][far], face_normal[far], atol=1e-7)
-        np.testing.assert_allclose(closest[mine][far], point[far], atol=2e-6)
+        np.testing.assert_allclose(((closest[mine] - point) * face_normal)[far].sum(1), 0.0, atol=1e-7)
+        across = np.cross(closest[mine] - end[mine], face_normal)
+        np.testing.assert_allclose(across[far], 0.0, atol=1e-7)
         redirected += far.sum()
     assert redirected > 20
 
