@@ -465,7 +465,7 @@ def test_pretrained_networks_are_the_saved_ones(tmp_path):
 
 def test_coarse_garments_keep_more_distance():
     """A body would show through between the vertices of coarse cloth. A fifth of the mean edge, at least 4 mm."""
-    from warpgarment.scene import clearance
+    from warpgarment.clearance import clearance
 
     vertices, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]]), np.array([[0, 1, 2]])
     mean = (2.0 + np.sqrt(2.0)) / 3.0

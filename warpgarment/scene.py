@@ -14,6 +14,7 @@ import torch
 
 from warpgarment import differentiable, memory
 from warpgarment.batch import PackedBodies, PackedGarments, padded_views
+from warpgarment.clearance import clearance
 from warpgarment.errors import MeshError
 from warpgarment.frame_graph import GraphedFrames
 from warpgarment.garment import Garment
@@ -32,8 +33,6 @@ from warpgarment.timing import Timings
 
 FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
 SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this
-CLOSEST = 0.004  # metres between a vertex and the body, at least
-CLEARANCE_PER_EDGE = 0.2  # ... and as a share of the mean edge length
 PINNED_MEAN = 0.9  # share of the way that q moves a pinned garment from where its pins alone would hold it
 SHALLOW = 1e-4  # metres: collisions are repeated while a vertex is deeper
 WORTHWHILE = 0.9  # ... and while a pass leaves at most this share of the depth before it
@@ -289,16 +288,6 @@ class Scene:
         """Whether a flag holds for all elements of a garment; [N] and owner [N] -> [B]."""
         wrong = torch.zeros(self.packed.count, dtype=torch.int32, device=flags.device)
         return wrong.index_add(0, garment.long(), (~flags).int()) == 0
-
-
-def clearance(garment: Garment) -> float:
-    """Distance that vertices keep from the body [m]: 4 mm, or a fifth of the mean edge length if that is more.
-
-    Contact is per vertex, so between the vertices of a coarse garment a round body would show through.
-    """
-    i, j = garment.edges.T
-    edge = float(np.linalg.norm(garment.vertices[i] - garment.vertices[j], axis=1).mean())
-    return max(CLOSEST, CLEARANCE_PER_EDGE * edge)
 
 
 def _together(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
