@@ -21,7 +21,7 @@ from warpgarment.pooled_geodesics import CENTRES
 from warpgarment.pooled_weights import dense_weights, pooled_weights
 
 from . import exact
-from .measure import Call, Row, aimed, compared
+from .measure import Call, Row, aimed, aimed_time, compared
 from .scenes import remeshed
 
 SOURCES = 4  # faces whose distances are held against exact ones
@@ -38,19 +38,14 @@ def geodesics(sizes: Sequence[int]) -> Iterator[Row]:
         with tempfile.TemporaryDirectory() as folder, mock.patch.dict(os.environ, WARPGARMENT_CACHE=folder):
             garment.__dict__.pop("geodesics", None)
             row = base | {"what": "geodesics of all pairs of faces"} | _once(lambda g=garment: g.geodesics)
-            yield _clocked(row) if 8_000 < count < 12_000 else row
+            how = f" by the clock on {usable_cores()} cores"
+            named = 8_000 < count < 12_000
+            yield aimed_time(row, 10_000.0, 10_000, 2.0, key="wall_ms", how=how) if named else row
             if count >= KEPT:
                 again = Garment(garment.vertices, garment.faces)
                 yield base | {"what": "the same from disk"} | _once(lambda g=again: g.geodesics)
         if number == 0:
             yield _worst(garment, base | {"what": "geodesics, off the exact ones"})
-
-
-def _clocked(row: Row) -> Row:
-    """The row held against the target, which is by the clock on two cores; how many there were is said."""
-    scaled = 1e-3 * row["wall_ms"] * (10_000 / row["faces"]) ** 2
-    reached = f"{scaled:.3g} s on {usable_cores()} cores, scaled from {row['faces']:,} faces"
-    return aimed(row, "under 10 s by the clock on 2 cores for 10,000 faces", reached, scaled < 10.0)
 
 
 def _worst(garment: Garment, base: Row) -> Row:

@@ -112,13 +112,14 @@ def aimed(row: Row, target: str, reached: str, met: bool) -> Row:
     return row if "note" in row else row | {"target": target, "reached": reached, "met": bool(met)}
 
 
-def aimed_time(row: Row, limit: float, faces: int, power: float = 1.0) -> Row:
-    """A row whose median is to stay under a limit [ms], scaled by a power of the faces to the number that was named."""
+def aimed_time(row: Row, limit: float, faces: int, power: float = 1.0, *, key: str = "median_ms", how: str = "") -> Row:
+    """A row whose median, or another time that `how` describes, is to stay under a limit [ms], scaled by a power of
+    the faces to the number that was named."""
     if "note" in row:
         return row
-    scaled = row["median_ms"] * (faces / row["faces"]) ** power
+    scaled = row[key] * (faces / row["faces"]) ** power
     unit, factor = ("s", 1e-3) if limit >= 1e3 else ("ms", 1.0)
-    target = f"under {factor * limit:g} {unit} for {faces:,} faces"
+    target = f"under {factor * limit:g} {unit}{how} for {faces:,} faces"
     return aimed(row, target, f"{factor * scaled:.3g} {unit}, scaled from {row['faces']:,} faces", scaled < limit)
 
 

@@ -148,8 +148,8 @@ def contacts(
             to the side where they went in. None: they leave by the nearest way.
 
     Returns:
-        Closest points, for those led back of the plane of that face, [m] and outward directions, float64 [V,3]; zero at
-        vertices that are not in C.
+        Closest points of the surface or, for vertices that are led back, of the plane of the face where they went in,
+        [m], and outward directions, float64 [V,3]; zero at vertices that are not in C.
     """
     vertices = vertices.detach().contiguous()
     body_of_vertex = bodies.body_of("body_of_vertex", body_of_vertex, len(vertices))
