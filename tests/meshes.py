@@ -145,6 +145,13 @@ def capsule(start, end, radius: float, around: int = 12, rings: int = 4) -> Mesh
     return _mesh(vertices, faces)
 
 
+def sheet_and_limb() -> tuple[Mesh, Mesh]:
+    """A level sheet of cloth facing up, and a closed limb 8 cm thick that lies 1 cm below it."""
+    grid = irregular_grid(20, 14)
+    sheet = _mesh((grid.vertices - np.float32([0.3, 0.2, 0.0]))[:, [0, 2, 1]], grid.faces[:, ::-1])
+    return sheet, capsule([-0.6, -0.05, 0.0], [0.6, -0.05, 0.0], 0.04, around=24, rings=6)
+
+
 def posed_body(phase: float = 0.0) -> Mesh:
     """A figure of overlapping capsules and spheres, 1.7 m tall, mid-stride; `phase` moves its limbs.
 

@@ -139,9 +139,7 @@ def test_a_limb_does_not_go_through_a_sheet(remembers):
 
     Left to the nearest way out, the sheet ends below; led back to where it went in, it is lifted.
     """
-    grid = meshes.irregular_grid(20, 14)
-    rest = meshes.Mesh((grid.vertices - [0.3, 0.2, 0.0])[:, [0, 2, 1]].astype(np.float32), grid.faces[:, ::-1].copy())
-    limb = meshes.capsule([-0.6, -0.05, 0.0], [0.6, -0.05, 0.0], 0.04, around=24, rings=6)
+    rest, limb = meshes.sheet_and_limb()
     bodies = BodyMeshes(torch.tensor(limb.vertices), torch.tensor(limb.faces))
     solver = CollisionSolver(torch.tensor(rest.vertices), torch.tensor(rest.faces))
     faces = torch.tensor(rest.faces)

@@ -19,9 +19,8 @@ def test_a_rollout_remembers_on_which_side_cloth_is(monkeypatch, remembers):
     monkeypatch.setattr(Scene, "reconstruct", lambda self, vertices, *rest: (vertices, solve(self, vertices, *rest)[1]))
     if not remembers:
         monkeypatch.setattr(Scene, "carried", lambda self, vertices, _: torch.full_like(vertices, torch.nan))
-    grid = meshes.irregular_grid(20, 14)
-    cloth = Garment((grid.vertices - np.float32([0.3, 0.2, 0.0]))[:, [0, 2, 1]], grid.faces[:, ::-1].copy())
-    limb = meshes.capsule([-0.6, -0.05, 0.0], [0.6, -0.05, 0.0], 0.04, around=24, rings=6)
+    sheet, limb = meshes.sheet_and_limb()
+    cloth = Garment(sheet.vertices, sheet.faces)
     rise = 0.05 * np.arange(4)[:, None, None] * np.float32([0.0, 1.0, 0.0])
     body = BodyMotion(limb.vertices + rise, limb.faces, 30.0)
     result = Simulator(network(), "cpu", epsilon=0.004).rollout(cloth, body)
