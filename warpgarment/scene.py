@@ -29,12 +29,13 @@ from warpgarment.kernels.sdf import BodyMeshes
 from warpgarment.network import GarmentNetwork, NetworkOutput
 from warpgarment.parametrisation import Step, compose, context
 from warpgarment.pins import BodyPins, mean_response
+from warpgarment.surface_points import SurfacePoints
 from warpgarment.timing import Timings
 
 FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
 SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this
 PINNED_MEAN = 0.9  # share of the way that q moves a pinned garment from where its pins alone would hold it
-SHALLOW = 1e-4  # metres: collisions are repeated while a vertex is deeper
+SHALLOW = 1e-4  # metres: collisions are repeated while anything of a garment is deeper
 WORTHWHILE = 0.9  # ... and while a pass leaves at most this share of the depth before it
 
 
@@ -88,6 +89,7 @@ class Scene:
         self.epsilon = torch.tensor(margins, device=device)[packed.garment_of_vertex.long()]
         self.body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
         self.body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
+        self.points = SurfacePoints(packed.faces, packed.garment_of_vertex, self.body_of_vertex, packed.count)
         self._bodies = BodyMeshes(body_vertices, bodies.faces, bodies.vertex_offsets, bodies.face_offsets)
         self.placed: torch.Tensor | None = body_vertices  # what the trees were last moved to
         self.refuse_far(first_vertices)
@@ -236,45 +238,43 @@ class Scene:
                 way.
 
         Returns:
-            Positions [V,3], finite [B], depth of each garment's deepest vertex [m] [B], and what the solver says of all
+            Positions [V,3], finite [B], depth of each garment's deepest point [m] [B], and what the solver says of all
             passes: iterations, components stopped by the limit and their largest error, float64 [3].
         """
         with self.timings("collision"):
-            bodies = self.bodies(next_body)
-            pending, depth, on_body = finite, None, self.body_of_vertex
+            bodies, points = self.bodies(next_body), self.points
+            pending, on_body, epsilon = finite, self.body_of_vertex, self.epsilon
+            inside = deepest = None
             solves = vertices.new_zeros(3, dtype=torch.float64)
             for _ in range(self.collision_passes):
-                refined = self.collision.refine(vertices, bodies, on_body, epsilon=self.epsilon, origin=origin)
+                if inside is not None:
+                    epsilon = points.distance_to_keep(epsilon, inside, vertices, bodies)
+                refined = self.collision.refine(vertices, bodies, on_body, epsilon=epsilon, origin=origin)
                 solves = _together(solves, self.collision.summary())
                 mine = pending[self.packed.garment_of_vertex.long()]
                 refined = torch.where(mine[:, None], refined, vertices)
                 vertices, finite = self.keep_finite(refined, vertices, finite)
-                before, depth = depth, self.depth(vertices, bodies, on_body)
+                inside = points.depth(vertices, bodies, pending)
+                before, deepest = deepest, points.deepest(inside)
                 if before is not None:
-                    depth = torch.where(pending, depth, before)
-                    pending = depth < WORTHWHILE * before
-                pending = finite & pending & (depth > SHALLOW)
+                    deepest = torch.where(pending, deepest, before)
+                    pending = deepest < WORTHWHILE * before
+                pending = finite & pending & (deepest > SHALLOW)
                 if self.early_exit and not pending.any():
                     break
                 on_body = torch.where(pending[self.packed.garment_of_vertex.long()], self.body_of_vertex, -1)
-            if depth is None:
-                depth = self.depth(vertices, bodies)
-        return vertices, finite, depth, solves
+            if deepest is None:
+                deepest = self.depth(vertices, bodies)
+        return vertices, finite, deepest, solves
 
     def tell(self, solves: np.ndarray) -> None:
         """Warns of solves that stopped at their limit; `solves` [2,3] as in `SimulationState`, read from the device."""
         for solver, (_, stopped, error) in zip((self.poisson, self.collision), solves, strict=True):
             solver.tell(stopped, error)
 
-    def depth(self, vertices: torch.Tensor, bodies: BodyMeshes, on_body: torch.Tensor | None = None) -> torch.Tensor:
-        """How deep the deepest vertex of each garment is in its body [m], at least 0; shape [B].
-
-        `on_body` [V] may leave garments out, whose depth is then NaN.
-        """
-        on_body = self.body_of_vertex if on_body is None else on_body
-        inside = -bodies.query(vertices, on_body, within=0.0).distance
-        index = self.packed.garment_of_vertex.long()
-        return inside.new_zeros(self.packed.count).scatter_reduce(0, index, inside, "amax")
+    def depth(self, vertices: torch.Tensor, bodies: BodyMeshes) -> torch.Tensor:
+        """How deep each garment is in its body at the deepest of its `points` [m], at least 0; shape [B]."""
+        return self.points.deepest(self.points.depth(vertices, bodies))
 
     def keep_finite(
         self, new: torch.Tensor, old: torch.Tensor, finite: torch.Tensor

@@ -6,7 +6,7 @@ import enum
 from dataclasses import dataclass
 
 PENETRATION_TOLERANCE = 0.01
-"""Depth of the deepest vertex [m] from which a frame counts as penetrating."""
+"""Depth of the deepest point [m] from which a frame counts as penetrating."""
 
 
 class Verdict(enum.Enum):
@@ -42,7 +42,8 @@ class RolloutStatus:
     Attributes:
         frame: Index in the motion, from 0.
         finite: Whether every position is finite.
-        max_penetration: Depth of the deepest vertex below the body's surface [m], at least 0.
+        max_penetration: Depth of the garment's deepest point below the body's surface [m], at least 0: of vertices,
+            thirds of edges and middles of faces.
         poisson_iterations: Conjugate gradient iterations of the Poisson solve, the largest of all components; 0 where
             it was solved directly.
         collision_iterations: The same of the collision refinement.
