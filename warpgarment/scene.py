@@ -244,7 +244,8 @@ class Scene:
         with self.timings("collision"):
             bodies, points = self.bodies(next_body), self.points
             pending, on_body, epsilon = finite, self.body_of_vertex, self.epsilon
-            inside = deepest = None
+            inside: torch.Tensor | None = None
+            deepest: torch.Tensor | None = None
             solves = vertices.new_zeros(3, dtype=torch.float64)
             for _ in range(self.collision_passes):
                 if inside is not None:
