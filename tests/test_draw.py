@@ -205,6 +205,20 @@ def test_a_film_that_fails_leaves_no_file(tmp_path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_palette_keeps_the_picture_and_saves_half(tmp_path):
+    """Pictures of tables would fill the repository, or come out spotted. A shaded ball: no channel off by 8 of 255."""
+    y, x = np.mgrid[-1:1:200j, -1:1:200j]
+    light = np.sqrt(np.clip(1 - x**2 - y**2, 0, 1))
+    image = (
+        np.stack([60 + 150 * light, 90 + 120 * light, 200 - 90 * light], -1) + 2 * np.sin(40 * x)[..., None]
+    ).astype(np.uint8)
+    draw.write_png(tmp_path / "all.png", image)
+    draw.write_png(tmp_path / "few.png", image, colors=256)
+    few = iio.imread(tmp_path / "few.png", mode="RGB").astype(int)
+    assert np.abs(few - image).max() < 8
+    assert (tmp_path / "few.png").stat().st_size < (tmp_path / "all.png").stat().st_size / 2
+
+
 @pytest.mark.parametrize(("module", "call"), [("imageio.v3", "write_png"), ("imageio_ffmpeg", "write_mp4")])
 def test_missing_extra_is_named(monkeypatch, tmp_path, module: str, call: str) -> None:
     """A ModuleNotFoundError from deep inside instead of what to install."""

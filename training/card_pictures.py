@@ -36,7 +36,7 @@ def contact_sheet(
     blank = np.full_like(panels[0], 255)
     panels += [blank] * (-len(panels) % columns)
     rows = [np.concatenate(panels[i : i + columns], axis=1) for i in range(0, len(panels), columns)]
-    draw.write_png(path, np.concatenate(rows, axis=0))
+    draw.write_png(path, np.concatenate(rows, axis=0), colors=256)
 
 
 def _panel(sequence: SequenceOnDisk, number: int, size: tuple[int, int], samples: int) -> np.ndarray:

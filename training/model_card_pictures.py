@@ -43,7 +43,7 @@ def rollout_sheet(
     """
     body = sequence.body_in(slice(0, len(truth)))
     while True:
-        draw.write_png(path, _sheet(body, sequence, moved, truth, drawn, size))
+        draw.write_png(path, _sheet(body, sequence, moved, truth, drawn, size), colors=256)
         if path.stat().st_size <= LARGEST:
             return
         size = (int(0.85 * size[0]), int(0.85 * size[1]))

@@ -47,9 +47,8 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     step = scene.predict(stacked, now.velocities)
     solved, finite = scene.reconstruct(vertices, step, features, next_body)
     poisson = scene.poisson.summary()
-    committed, finite, depth, collision = scene.push_out(
-        solved, next_body, finite & now.finite, scene.carried(vertices, features)
-    )
+    origin = scene.carried(vertices, features) if scene.collision_passes else None
+    committed, finite, depth, collision = scene.push_out(solved, next_body, finite & now.finite, origin)
     velocity = scene.components_mean(committed) - scene.components_mean(vertices)
     history = now.history.followed(stacked, velocity)
     solves = torch.stack([poisson, collision])

@@ -34,12 +34,22 @@ def _written(image: np.ndarray, text: str, corner: tuple[int, int], size: int, c
     return np.asarray(picture)
 
 
-def write_png(path: str | Path, image: np.ndarray) -> None:
-    """Writes uint8 [H, W, 3]; the file appears complete or not at all."""
+def write_png(path: str | Path, image: np.ndarray, *, colors: int | None = None) -> None:
+    """Writes uint8 [H, W, 3]; the file appears complete or not at all.
+
+    Args:
+        path: Of the file.
+        image: The picture.
+        colors: Size of the palette, at most 256, which makes the file three times smaller; None: all colours are kept.
+    """
     with _needs_view():
         import imageio.v3 as iio
+        from PIL import Image
     with atomic_file(Path(path)) as temporary:
-        iio.imwrite(temporary, image, extension=".png")
+        if colors is None:
+            iio.imwrite(temporary, image, extension=".png")
+        else:
+            Image.fromarray(image).quantize(colors, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
 
 
 def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float = 30.0) -> int:

@@ -74,7 +74,7 @@ def rollouts(path: Path, keeper: Keeper, titles: Ordered[tuple[str, str]], size=
             strip = [draw.caption(p, f"{t / whole.fps:.1f} s") for p, t in zip(panels, moments, strict=True)]
             strips.append(draw.titled(np.concatenate(strip, axis=1), title, size=13))
     if strips:
-        draw.write_png(path, np.concatenate(strips, axis=0))
+        draw.write_png(path, np.concatenate(strips, axis=0), colors=256)
     return bool(strips)
 
 
