@@ -13,7 +13,7 @@ CLEARANCE_PER_EDGE = 0.2  # ... and as a share of the mean edge length
 def clearance(garment: Garment) -> float:
     """Distance that vertices keep from the body [m]: 4 mm, or a fifth of the mean edge length if that is more.
 
-    Between the vertices of a coarse garment a round body comes nearer; see also `surface_points`.
+    Between the vertices of a coarse garment a round body comes nearer; see also `surface`.
     """
     i, j = garment.edges.T
     edge = float(np.linalg.norm(garment.vertices[i] - garment.vertices[j], axis=1).mean())

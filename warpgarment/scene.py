@@ -26,10 +26,11 @@ from warpgarment.kernels.frame_features import frame_features
 from warpgarment.kernels.next_gradients import next_gradients
 from warpgarment.kernels.poisson import PoissonSolver
 from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.kernels.surface_depth import SurfaceDepth
 from warpgarment.network import GarmentNetwork, NetworkOutput
 from warpgarment.parametrisation import Step, compose, context
 from warpgarment.pins import BodyPins, mean_response
-from warpgarment.surface_points import SurfacePoints
+from warpgarment.surface import Surface, distance_to_keep
 from warpgarment.timing import Timings
 
 FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
@@ -89,7 +90,7 @@ class Scene:
         self.epsilon = torch.tensor(margins, device=device)[packed.garment_of_vertex.long()]
         self.body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
         self.body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
-        self.points = SurfacePoints(packed.faces, packed.garment_of_vertex, self.body_of_vertex, packed.count)
+        self.surface = Surface(garments, packed)
         self._bodies = BodyMeshes(body_vertices, bodies.faces, bodies.vertex_offsets, bodies.face_offsets)
         self.placed: torch.Tensor | None = body_vertices  # what the trees were last moved to
         self.refuse_far(first_vertices)
@@ -242,31 +243,29 @@ class Scene:
             passes: iterations, components stopped by the limit and their largest error, float64 [3].
         """
         with self.timings("collision"):
-            bodies, points = self.bodies(next_body), self.points
-            pending, on_body, epsilon = finite, self.body_of_vertex, self.epsilon
-            inside: torch.Tensor | None = None
-            deepest: torch.Tensor | None = None
+            bodies, on_body, epsilon = self.bodies(next_body), self.body_of_vertex, self.epsilon
+            pending, depth = finite, vertices.new_zeros(self.packed.count)
+            inside: SurfaceDepth | None = None
             solves = vertices.new_zeros(3, dtype=torch.float64)
             for _ in range(self.collision_passes):
                 if inside is not None:
-                    epsilon = points.distance_to_keep(epsilon, inside, vertices, bodies)
+                    epsilon = distance_to_keep(epsilon, inside.missing, vertices, bodies, on_body)
                 refined = self.collision.refine(vertices, bodies, on_body, epsilon=epsilon, origin=origin)
                 solves = _together(solves, self.collision.summary())
                 mine = pending[self.packed.garment_of_vertex.long()]
                 refined = torch.where(mine[:, None], refined, vertices)
                 vertices, finite = self.keep_finite(refined, vertices, finite)
-                inside = points.depth(vertices, bodies, pending)
-                before, deepest = deepest, points.deepest(inside)
-                if before is not None:
-                    deepest = torch.where(pending, deepest, before)
-                    pending = deepest < WORTHWHILE * before
-                pending = finite & pending & (deepest > SHALLOW)
+                found = self.surface.depth(vertices, bodies, on_body)
+                now = torch.where(pending, found.garments, depth)
+                worthwhile = pending if inside is None else now < WORTHWHILE * depth
+                depth, inside = now, found
+                pending = finite & worthwhile & (depth > SHALLOW)
                 if self.early_exit and not pending.any():
                     break
                 on_body = torch.where(pending[self.packed.garment_of_vertex.long()], self.body_of_vertex, -1)
-            if deepest is None:
-                deepest = self.depth(vertices, bodies)
-        return vertices, finite, deepest, solves
+            if inside is None:
+                depth = self.depth(vertices, bodies)
+        return vertices, finite, depth, solves
 
     def tell(self, solves: np.ndarray) -> None:
         """Warns of solves that stopped at their limit; `solves` [2,3] as in `SimulationState`, read from the device."""
@@ -274,8 +273,8 @@ class Scene:
             solver.tell(stopped, error)
 
     def depth(self, vertices: torch.Tensor, bodies: BodyMeshes) -> torch.Tensor:
-        """How deep each garment is in its body at the deepest of its `points` [m], at least 0; shape [B]."""
-        return self.points.deepest(self.points.depth(vertices, bodies))
+        """How deep each garment is in its body, between its vertices too [m], at least 0; shape [B]."""
+        return self.surface.depth(vertices, bodies, self.body_of_vertex).garments
 
     def keep_finite(
         self, new: torch.Tensor, old: torch.Tensor, finite: torch.Tensor
