@@ -42,8 +42,8 @@ class RolloutStatus:
     Attributes:
         frame: Index in the motion, from 0.
         finite: Whether every position is finite.
-        max_penetration: Depth of the garment's deepest point below the body's surface [m], at least 0: of its vertices, and
-            of points of its edges and faces, see `kernels.surface_depth`.
+        max_penetration: Depth of the garment's deepest point below the body's surface [m], at least 0: of its
+            vertices, and of points of its edges and faces, see `kernels.surface_depth`.
         poisson_iterations: Conjugate gradient iterations of the Poisson solve, the largest of all components; 0 where
             it was solved directly.
         collision_iterations: The same of the collision refinement.
