@@ -37,7 +37,6 @@ FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body
 SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this
 PINNED_MEAN = 0.9  # share of the way that q moves a pinned garment from where its pins alone would hold it
 SHALLOW = 1e-4  # metres: collisions are repeated while anything of a garment is deeper
-WORTHWHILE = 0.9  # ... and while a pass leaves at most this share of the depth before it
 
 
 class Scene:
@@ -226,7 +225,7 @@ class Scene:
     def push_out(
         self, vertices: torch.Tensor, next_body: torch.Tensor, finite: torch.Tensor, origin: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Step 5: refines collisions, again for garments that are still deep and while it helps them.
+        """Step 5: refines collisions, again for garments of which anything is still deep.
 
         Which garments these are is decided on the device. The others are on no body in a later pass, so their vertices
         touch nothing and cost next to nothing; the CPU leaves out passes that no garment needs.
@@ -255,11 +254,9 @@ class Scene:
                 mine = pending[self.packed.garment_of_vertex.long()]
                 refined = torch.where(mine[:, None], refined, vertices)
                 vertices, finite = self.keep_finite(refined, vertices, finite)
-                found = self.surface.depth(vertices, bodies, on_body)
-                now = torch.where(pending, found.garments, depth)
-                worthwhile = pending if inside is None else now < WORTHWHILE * depth
-                depth, inside = now, found
-                pending = finite & worthwhile & (depth > SHALLOW)
+                inside = self.surface.depth(vertices, bodies, on_body)
+                depth = torch.where(pending, inside.garments, depth)
+                pending = finite & pending & (depth > SHALLOW)
                 if self.early_exit and not pending.any():
                     break
                 on_body = torch.where(pending[self.packed.garment_of_vertex.long()], self.body_of_vertex, -1)

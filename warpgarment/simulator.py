@@ -39,7 +39,7 @@ class Simulator:
         device: "cpu", "cuda", ...; None takes CUDA where there is any.
         epsilon: Distance that collision refinement keeps between vertices and body [m]. None: 4 mm, or a fifth of a
             garment's mean edge length if that is more, since a body shows through between the vertices of coarse cloth.
-        collision_passes: Collision refinement is repeated while a vertex is more than 1 mm deep and it helps, at most
+        collision_passes: Collision refinement is repeated while anything of a garment is more than 0.1 mm deep, at most
             so often per frame; 0 leaves it out.
         half: Run the transformer in bfloat16: faster on recent GPUs. Geometry stays in float32.
         graph: Replay frames as one CUDA graph, after the first few (`frame_graph.py`). None: on CUDA, and a graph that
