@@ -234,8 +234,8 @@ def solve(
     load, result = cg.view(rhs, wp.vec3d), cg.view(solution, wp.vec3d)
     with torch_stream(rhs.device) as device:
         if not int(factor.counts[2]):
-            work = cg.view(allocate((int(factor.counts[3]), 4), torch.float64, rhs.device), wp.vec4d)
-            inputs = [*common, *substitution(factor), load, work, result]
+            scratch = allocate((int(factor.counts[3]), 4), torch.float64, rhs.device)
+            inputs = [*common, *substitution(factor), load, cg.view(scratch, wp.vec4d), result]
             wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
             return
         base, order = cg.view(factor.base, wp.int32), cg.view(factor.order, wp.int32)
@@ -247,7 +247,8 @@ def solve(
             )
         )
         common += [cg.view(vertex_component, wp.int32), base, order]
-        work = cg.view(allocate(rhs.shape, torch.float64, rhs.device), wp.vec3d)
+        scratch = allocate(rhs.shape, torch.float64, rhs.device)
+        work = cg.view(scratch, wp.vec3d)
         block = LANES if rhs.is_cuda else cg.block_dim(rhs.device, len(rhs), 1)
         first = [*common, cg.view(factor.pivot, wp.float64), *rows, load, work]
         second = [*common, *columns, work, result]
