@@ -49,7 +49,7 @@ def write_png(path: str | Path, image: np.ndarray, *, colors: int | None = None)
         if colors is None:
             iio.imwrite(temporary, image, extension=".png")
         else:
-            Image.fromarray(image).quantize(colors, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
+            Image.fromarray(image).quantize(colors, kmeans=2).save(temporary, "PNG", optimize=True)
 
 
 def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float = 30.0) -> int:
