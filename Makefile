@@ -2,6 +2,7 @@
 # make test    installs what the tests need and runs them
 # make lint    ruff and mypy
 # make bench   times a rollout by stage on this machine
+# make gpu     on a machine with a GPU: what it computes beside a CPU, then all benchmarks
 #
 # PYTHON  interpreter the environment is made with           make demo PYTHON=python3.12
 # TORCH   what to give pip install for torch (a GPU build)   make demo TORCH="torch --index-url ..."
@@ -17,7 +18,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 # torch is installed first and by itself; left in, its line would contradict another TORCH
 CONSTRAINTS := $(VENV)/constraints.txt
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench gpu clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.demo
@@ -32,6 +33,10 @@ lint: $(VENV)/.test
 
 bench: $(VENV)/.demo
 	$(BIN)/warpgarment bench $(if $(DEVICE),--device $(DEVICE))
+
+gpu: $(VENV)/.test
+	$(BIN)/python -m pytest tests/test_on_gpu.py tests/test_frames_on_device.py tests/test_cuda_compilation.py
+	$(BIN)/python -m benchmarks
 
 clean:
 	rm -rf $(VENV) out build
