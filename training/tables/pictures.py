@@ -20,6 +20,7 @@ from .protocol import FIGURES, STARTS
 INCHES = 0.24  # a bar's height
 COLOURS = {"warm": draw.CORAL, "cold": draw.OCHRE}
 PANELS = ("mean_vertex_error_cm", "geodesic_distortion_m")
+SWEPT = {"power": "power p", "radius": "radius r [m]"}
 MOMENTS = 6
 
 
@@ -108,18 +109,22 @@ def bars(path: Path, rows: Ordered[dict[str, Any]]) -> None:
 
 def sweeps(path: Path, rows: Ordered[dict[str, Any]]) -> None:
     """Draws the error over power and over radius."""
-    figure, axes = axes_of(2, height=3.6, width=4.6)
+    swept = {}
+    for key in SWEPT:
+        mine = [row for row in rows if key in row.get("value", {})]
+        if len(mine) > 1 or not swept:
+            swept[key] = sorted(mine, key=lambda row, key=key: row["value"][key])
+    figure, axes = axes_of(len(swept), height=3.6, width=4.6)
     baselines = next((row["mean"] for row in rows if row["row"] == "baselines"), {})
-    for axis, (key, text) in zip(axes, (("power", "power p"), ("radius", "radius r [m]")), strict=True):
-        mine = sorted((row for row in rows if key in row.get("value", {})), key=lambda row: row["value"][key])
+    for axis, (key, mine) in zip(axes, swept.items(), strict=True):
         for start, line in (("warm", "-"), ("cold", "--")):
             values = [shown(row["mean"][start]["network"]["mean_vertex_error_cm"]) for row in mine]
             axis.plot([row["value"][key] for row in mine], values, f"o{line}", color=COLOURS[start], label=start)
             if start in baselines:
                 level = shown(baselines[start]["skinned"]["mean_vertex_error_cm"])
                 axis.axhline(level, ls=line, color=draw.SLATE, lw=1, label=f"skinned, {start}")
-        axis.set(xscale="log", xlabel=text, ylabel="mean vertex error [cm]")
-        axis.set_ylim(bottom=0)
+        axis.set(xscale="log", xlabel=SWEPT[key], ylabel="mean vertex error [cm]")
+        axis.set_ylim(0, 1.05 * max(1e-9, axis.get_ylim()[1]))
         axis.grid(alpha=0.3)
     axes[0].legend(frameon=False, fontsize=8)
     save(figure, path)
