@@ -109,14 +109,12 @@ def bars(path: Path, rows: Ordered[dict[str, Any]]) -> None:
 
 def sweeps(path: Path, rows: Ordered[dict[str, Any]]) -> None:
     """Draws the error over power and over radius."""
-    swept = {}
-    for key in SWEPT:
-        mine = [row for row in rows if key in row.get("value", {})]
-        if len(mine) > 1 or not swept:
-            swept[key] = sorted(mine, key=lambda row, key=key: row["value"][key])
+    having = {key: [row for row in rows if key in row.get("value", {})] for key in SWEPT}
+    swept = {key: mine for key, mine in having.items() if len(mine) > 1} or having
     figure, axes = axes_of(len(swept), height=3.6, width=4.6)
     baselines = next((row["mean"] for row in rows if row["row"] == "baselines"), {})
     for axis, (key, mine) in zip(axes, swept.items(), strict=True):
+        mine.sort(key=lambda row, key=key: row["value"][key])
         for start, line in (("warm", "-"), ("cold", "--")):
             values = [shown(row["mean"][start]["network"]["mean_vertex_error_cm"]) for row in mine]
             axis.plot([row["value"][key] for row in mine], values, f"o{line}", color=COLOURS[start], label=start)
