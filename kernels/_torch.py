@@ -12,7 +12,7 @@ import warp as wp
 if wp.config.log_level == wp.LOG_INFO:  # the user's own setting stays; Warp's default prints at every module load
     wp.config.log_level = wp.LOG_WARNING
 
-MOST_DESCRIPTORS = 16_384
+MOST_DESCRIPTORS = 16_384  # a few MB; a frame has some hundred, a training many that never come again
 _descriptors: dict[tuple[object, ...], Any] = {}
 
 _DTYPES = {torch.float32: "float32", torch.int32: "int32"}
@@ -58,7 +58,7 @@ def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
 
 
 def as_argument(tensor: torch.Tensor, dtype: type) -> object:
-    """What `as_warp` says, for the arguments of a launch alone, at a fifth of the cost: a descriptor.
+    """What `as_warp` says, for the arguments of a launch alone, at a tenth of the cost: a descriptor.
 
     It keeps no memory alive, so the tensor must outlive the launch; a copy that had to be made is kept by its array.
     """

@@ -186,7 +186,7 @@ class System(NamedTuple):
 
 
 def view(tensor: torch.Tensor, dtype: type) -> object:
-    """The descriptor of a contiguous tensor as a launch argument; keeps nothing alive and costs a fifth of an array."""
+    """The descriptor of a contiguous tensor as a launch argument; keeps nothing alive and costs a tenth of an array."""
     if tensor.numel() == 0:
         tensor = tensor.new_empty(tensor.shape)  # slices of nothing have strides that Warp refuses
     return descriptor(tensor, dtype)

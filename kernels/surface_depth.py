@@ -31,7 +31,7 @@ from .closest import Bodies, closest_on_body
 from .contacts import closest_on_triangle
 
 STANDS_OUT = wp.constant(0.01)
-"""l [m]; a body that stands out further surrounds one of the other points as well."""
+"""l [m]. Of what stands out further, vertices that are lower down are found; a bare spike is missed."""
 
 
 class SurfaceDepth(NamedTuple):
