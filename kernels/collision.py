@@ -32,9 +32,10 @@ import numpy as np
 import scipy.sparse
 import torch
 
-from . import cg, compliance, factor
+from . import compliance, factor
 from ._torch import expect
 from .body_meshes import BodyMeshes
+from .cg import Progress, System
 from .collision_operator import ADJOINT_TOLERANCE as ADJOINT_TOLERANCE
 from .collision_operator import model_of
 from .compliance import Compliance
@@ -95,13 +96,13 @@ class CollisionSolver:
         laplacian = cotangent_laplacian(rest_vertices, faces)
         base = lambda_lap * (laplacian.T @ laplacian) + lambda_reg * scipy.sparse.identity(vertex_count)
         vertex_component, _, count = components(vertex_count, as_numpy("faces", faces, np.int32))
-        system = cg.System.build(base.tocsr(), vertex_component, count, device)
+        system = System.build(base.tocsr(), vertex_component, count, device)
         one_core = device.type == "cpu" if one_core is None else one_core
         dense = Compliance.build(base.tocsr(), system, largest_compliance, compliance_budget)
         budget = factor_budget if one_core else 0
         factors = Factor.build(base.tocsr(), system, explicit=False, budget=budget, skip=dense.base.cpu().numpy() >= 0)
         self._model = model_of(system, dense, factors, torch.from_numpy(vertex_component).to(device), one_core)
-        self._progress = cg.Progress("CollisionSolver")
+        self._progress = Progress("CollisionSolver")
         self._contacts: torch.Tensor | None = None
         self.vertex_count = vertex_count
         self.component_count = count

@@ -18,6 +18,7 @@ import warp as wp
 from . import cg, compliance_lanes, contact_forces, triangular, wide_contacts
 from ._operator import allocate
 from ._torch import torch_stream
+from .cg import System, view
 from .compliance import Compliance
 from .contacts import contact_gap
 from .factor import Factor
@@ -32,20 +33,20 @@ The residual is a bound, and the error in the energy norm a small part of it. Me
 """
 
 
-Parts = tuple[cg.System, Compliance, Factor, torch.Tensor, bool]
+Parts = tuple[System, Compliance, Factor, torch.Tensor, bool]
 
 
 def model_of(
-    system: cg.System, dense: Compliance, factor: Factor, vertex_component: torch.Tensor, one_core: bool
+    system: System, dense: Compliance, factor: Factor, vertex_component: torch.Tensor, one_core: bool
 ) -> list[torch.Tensor]:
     """The tensors of a solver, which travel through the operators as one list."""
     return [*system, *dense, *factor, vertex_component, torch.tensor(one_core)]
 
 
 def _parts(model: list[torch.Tensor]) -> Parts:
-    ends = [len(kind._fields) for kind in (cg.System, Compliance, Factor)]
+    ends = [len(kind._fields) for kind in (System, Compliance, Factor)]
     first, second, third = ends[0], ends[0] + ends[1], sum(ends)
-    system, dense, factor = cg.System(*model[:first]), Compliance(*model[first:second]), Factor(*model[second:third])
+    system, dense, factor = System(*model[:first]), Compliance(*model[first:second]), Factor(*model[second:third])
     return system, dense, factor, model[third], bool(model[third + 1])
 
 
@@ -110,11 +111,11 @@ def collision_solve(
             contact_gap,
             dim=len(vertices),
             inputs=[
-                cg.view(vertices, wp.vec3),
-                cg.view(normal, wp.vec3d),
-                cg.view(closest, wp.vec3d),
+                view(vertices, wp.vec3),
+                view(normal, wp.vec3d),
+                view(closest, wp.vec3d),
                 float(epsilon),
-                cg.view(gap, wp.float64),
+                view(gap, wp.float64),
             ],
             device=device,
         )

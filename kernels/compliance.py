@@ -30,7 +30,7 @@ import numpy as np
 import scipy.sparse
 import torch
 
-from . import cg
+from .cg import System
 from .factor import component_blocks
 
 LARGEST = 2048
@@ -56,7 +56,7 @@ class Compliance(NamedTuple):
     """float32, the blocks, row by row; rows are padded with zeros to a multiple of sixteen."""
 
     @classmethod
-    def build(cls, matrix: scipy.sparse.csr_matrix, system: cg.System, largest: int, budget: int) -> Compliance:
+    def build(cls, matrix: scipy.sparse.csr_matrix, system: System, largest: int, budget: int) -> Compliance:
         """Inverts the diagonal blocks of B, [V,V], that are small enough, until the budget is used up."""
         device = system.value.device
         rows, start = system.rows.cpu().numpy(), system.start.cpu().numpy()

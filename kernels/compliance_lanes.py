@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from . import cg
 from ._operator import allocate
 from ._torch import torch_stream
+from .cg import System, block_dim, block_sum, view
 from .compliance import Compliance
 
 
@@ -76,7 +76,7 @@ def solve_contacts(
             direction[first + k] = c
             rr += c * c
             k += stride
-        rr = cg.block_sum(rr)
+        rr = block_sum(rr)
 
         goal = tolerance[component] * tolerance[component]
         total = wp.float64(0.0)
@@ -99,7 +99,7 @@ def solve_contacts(
                 image[first + k] = s
                 pq += direction[first + k] * s
                 k += stride
-            pq = cg.block_sum(pq)
+            pq = block_sum(pq)
             alpha = rr / pq
 
             rr_next = wp.float64(0.0)
@@ -111,7 +111,7 @@ def solve_contacts(
                 residual[first + k] = r
                 rr_next += r * r
                 k += stride
-            rr_next = cg.block_sum(rr_next)
+            rr_next = block_sum(rr_next)
 
             beta = rr_next / rr
             k = lane
@@ -122,7 +122,7 @@ def solve_contacts(
             total += alpha * rr
             iteration += 1
             running = rr_next > wp.max(goal, relative * relative * total)
-            rr = cg.block_sum(rr_next) / wp.float64(stride)  # the barrier between direction and the next product
+            rr = block_sum(rr_next) / wp.float64(stride)  # the barrier between direction and the next product
 
         if not (rr >= zero):  # NaN in, NaN out
             k = lane
@@ -195,7 +195,7 @@ def response(
     gap[i] = h
 
 
-def list_contacts(system: cg.System, normal: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def list_contacts(system: System, normal: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Contacts sorted by component, without waiting for the device.
 
     Returns:
@@ -210,7 +210,7 @@ def list_contacts(system: cg.System, normal: torch.Tensor) -> tuple[torch.Tensor
 
 
 def solve(
-    system: cg.System,
+    system: System,
     model: Compliance,
     listed: tuple[torch.Tensor, torch.Tensor],
     normal: torch.Tensor,
@@ -232,32 +232,32 @@ def solve(
             solve_contacts,
             dim=[count],
             inputs=[
-                cg.view(system.start, wp.int32),
-                cg.view(model.base, wp.int64),
-                cg.view(model.room, wp.int64),
-                cg.view(model.local, wp.int32),
-                cg.view(model.values, wp.float32),
-                cg.view(end, wp.int32),
-                cg.view(contacts, wp.int64),
-                cg.view(normal, wp.vec3d),
-                cg.view(gap, wp.float64),
-                cg.view(tolerance, wp.float64),
+                view(system.start, wp.int32),
+                view(model.base, wp.int64),
+                view(model.room, wp.int64),
+                view(model.local, wp.int32),
+                view(model.values, wp.float32),
+                view(end, wp.int32),
+                view(contacts, wp.int64),
+                view(normal, wp.vec3d),
+                view(gap, wp.float64),
+                view(tolerance, wp.float64),
                 float(relative),
                 int(max_iterations),
-                cg.view(coupling, wp.float32),
-                *(cg.view(vector, wp.float64) for vector in work),
-                cg.view(force, wp.float64),
-                cg.view(report, wp.int32),
-                cg.view(error, wp.float64),
+                view(coupling, wp.float32),
+                *(view(vector, wp.float64) for vector in work),
+                view(force, wp.float64),
+                view(report, wp.int32),
+                view(error, wp.float64),
             ],
-            block_dim=cg.block_dim(normal.device, vertices, count),
+            block_dim=block_dim(normal.device, vertices, count),
             device=device,
         )
     return force
 
 
 def displace(
-    system: cg.System,
+    system: System,
     model: Compliance,
     vertex_component: torch.Tensor,
     listed: tuple[torch.Tensor, torch.Tensor],
@@ -271,23 +271,23 @@ def displace(
             displacement,
             dim=len(normal),
             inputs=[
-                cg.view(system.start, wp.int32),
-                cg.view(vertex_component, wp.int32),
-                cg.view(model.base, wp.int64),
-                cg.view(model.local, wp.int32),
-                cg.view(model.values, wp.float32),
-                cg.view(listed[0], wp.int32),
-                cg.view(listed[1], wp.int64),
-                cg.view(normal, wp.vec3d),
-                cg.view(force, wp.float64),
-                cg.view(increment, wp.vec3d),
+                view(system.start, wp.int32),
+                view(vertex_component, wp.int32),
+                view(model.base, wp.int64),
+                view(model.local, wp.int32),
+                view(model.values, wp.float32),
+                view(listed[0], wp.int32),
+                view(listed[1], wp.int64),
+                view(normal, wp.vec3d),
+                view(force, wp.float64),
+                view(increment, wp.vec3d),
             ],
             device=device,
         )
 
 
 def respond(
-    system: cg.System, model: Compliance, vertex_component: torch.Tensor, normal: torch.Tensor, load: torch.Tensor
+    system: System, model: Compliance, vertex_component: torch.Tensor, normal: torch.Tensor, load: torch.Tensor
 ) -> torch.Tensor:
     """n·(Z g) at the contacts, float64 [V]; `load` is g, float64 [V,3]."""
     gap = allocate((len(normal),), torch.float64, normal.device)
@@ -296,15 +296,15 @@ def respond(
             response,
             dim=len(normal),
             inputs=[
-                cg.view(system.start, wp.int32),
-                cg.view(system.rows, wp.int32),
-                cg.view(vertex_component, wp.int32),
-                cg.view(model.base, wp.int64),
-                cg.view(model.local, wp.int32),
-                cg.view(model.values, wp.float32),
-                cg.view(normal, wp.vec3d),
-                cg.view(load, wp.vec3d),
-                cg.view(gap, wp.float64),
+                view(system.start, wp.int32),
+                view(system.rows, wp.int32),
+                view(vertex_component, wp.int32),
+                view(model.base, wp.int64),
+                view(model.local, wp.int32),
+                view(model.values, wp.float32),
+                view(normal, wp.vec3d),
+                view(load, wp.vec3d),
+                view(gap, wp.float64),
             ],
             device=device,
         )

@@ -24,9 +24,9 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from . import cg
 from ._operator import allocate
 from ._torch import torch_stream
+from .cg import System, view
 from .factor import Factor
 from .triangular import eliminate, padded, substitute_back, substitution
 
@@ -169,7 +169,7 @@ def contact_forces(
 
 
 def solve(
-    system: cg.System,
+    system: System,
     factor: Factor,
     normal: torch.Tensor,
     gap: torch.Tensor,
@@ -206,22 +206,22 @@ def solve(
             contact_forces,
             dim=len(factor.base),
             inputs=[
-                cg.view(system.start, wp.int32),
-                cg.view(system.rows, wp.int32),
+                view(system.start, wp.int32),
+                view(system.rows, wp.int32),
                 *substitution(factor),
-                cg.view(normal, wp.vec3d),
-                cg.view(gap, wp.float64),
-                cg.view(tolerance, wp.float64),
+                view(normal, wp.vec3d),
+                view(gap, wp.float64),
+                view(tolerance, wp.float64),
                 float(relative),
                 int(max_iterations),
-                *(cg.view(t, wp.int32) for t in integers),
-                cg.view(vectors[0], wp.vec4d),
-                *(cg.view(t, wp.float64) for t in scalars),
-                cg.view(vectors[1], wp.vec4d),
-                cg.view(force, wp.float64),
-                cg.view(increment, wp.vec3d),
-                cg.view(report, wp.int32),
-                cg.view(error, wp.float64),
+                *(view(t, wp.int32) for t in integers),
+                view(vectors[0], wp.vec4d),
+                *(view(t, wp.float64) for t in scalars),
+                view(vectors[1], wp.vec4d),
+                view(force, wp.float64),
+                view(increment, wp.vec3d),
+                view(report, wp.int32),
+                view(error, wp.float64),
             ],
             device=warp_device,
         )

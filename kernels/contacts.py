@@ -10,10 +10,10 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from . import cg
 from ._operator import allocate
 from ._torch import torch_stream
 from .body_meshes import BodyMeshes
+from .cg import view
 from .closest import Bodies
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
@@ -161,14 +161,14 @@ def contacts(
             dim=len(vertices),
             inputs=[
                 bodies.model,
-                cg.view(vertices, wp.vec3),
-                cg.view(distance, wp.float32),
-                cg.view(face, wp.int32),
-                cg.view(body_of_vertex, wp.int32),
-                cg.view(origin, wp.vec3),
+                view(vertices, wp.vec3),
+                view(distance, wp.float32),
+                view(face, wp.int32),
+                view(body_of_vertex, wp.int32),
+                view(origin, wp.vec3),
                 float(epsilon),
-                cg.view(closest, wp.vec3d),
-                cg.view(normal, wp.vec3d),
+                view(closest, wp.vec3d),
+                view(normal, wp.vec3d),
             ],
             device=device,
         )

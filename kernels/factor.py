@@ -40,7 +40,7 @@ import torch
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from . import cg
+from .cg import System
 
 BUDGET = 2**26
 """Numbers in all factors of a solver together, 8 bytes each and half as much for indices (768 MiB)."""
@@ -76,7 +76,7 @@ class Factor(NamedTuple):
     def build(
         cls,
         matrix: scipy.sparse.csr_matrix,
-        system: cg.System,
+        system: System,
         *,
         explicit: bool,
         budget: int = BUDGET,
@@ -124,7 +124,7 @@ class Factor(NamedTuple):
 
 
 def component_blocks(
-    matrix: scipy.sparse.csr_matrix, system: cg.System
+    matrix: scipy.sparse.csr_matrix, system: System
 ) -> Iterator[tuple[tuple, scipy.sparse.csc_matrix]]:
     """The diagonal block of each component of a symmetric matrix, and a key that equal blocks share."""
     rows, start = system.rows.cpu().numpy(), system.start.cpu().numpy()

@@ -33,8 +33,9 @@ import numpy as np
 import scipy.sparse
 import torch
 
-from . import cg, factor
+from . import factor
 from ._torch import expect
+from .cg import Progress, System
 from .laplacian import as_numpy, components, cotangent_laplacian, half_cotangents
 from .poisson_kernels import FREE, ISOLATED, PINNED
 from .poisson_operator import ADJOINT_TOLERANCE as ADJOINT_TOLERANCE
@@ -131,12 +132,12 @@ class PoissonSolver:
         tensors["rest_vertices"] = rest_vertices.detach().clone(memory_format=torch.contiguous_format)
         tensors["faces"] = faces.detach().clone(memory_format=torch.contiguous_format)
         matrix = (matrix + scipy.sparse.diags(stiffness)).tocsr()
-        system = cg.System.build(matrix, vertex_component, count, device)
+        system = System.build(matrix, vertex_component, count, device)
         explicit = device.type != "cpu" if explicit is None else explicit
         grounded = (matrix + scipy.sparse.diags(_ground(matrix, vertex_component, kind))).tocsr()
         factors = factor.Factor.build(grounded, system, explicit=explicit, budget=factor_budget)
         self._model = [*(tensors[name] for name, _ in MODEL), *system, *factors]
-        self._progress = cg.Progress("PoissonSolver")
+        self._progress = Progress("PoissonSolver")
         self.rest_vertices, self.faces = tensors["rest_vertices"], tensors["faces"]
         self.pins = tensors["pins"]
         self.vertex_component = tensors["vertex_component"]

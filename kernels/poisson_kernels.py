@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from . import cg
+from .cg import block_sum
 
 FREE = wp.constant(0)  # translation from `mean`
 PINNED = wp.constant(1)  # translation from the pins
@@ -78,7 +78,7 @@ def place(
         i = rows[k]
         shift -= centroid_weight[i] * (initial[i] + increment[i])
         k += stride
-    shift = wp.vec3d(cg.block_sum(shift[0]), cg.block_sum(shift[1]), cg.block_sum(shift[2]))
+    shift = wp.vec3d(block_sum(shift[0]), block_sum(shift[1]), block_sum(shift[2]))
     shift += wp.vec3d(mean[component])
     if kind[component] != FREE:
         shift = wp.vec3d()
@@ -110,7 +110,7 @@ def place_adjoint(
     while k < start[component + 1]:
         total += wp.vec3d(grad_vertices[rows[k]])
         k += stride
-    total = wp.vec3d(cg.block_sum(total[0]), cg.block_sum(total[1]), cg.block_sum(total[2]))
+    total = wp.vec3d(block_sum(total[0]), block_sum(total[1]), block_sum(total[2]))
     if kind[component] != FREE:
         total = wp.vec3d()
     k = start[component] + lane

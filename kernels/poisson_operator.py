@@ -8,13 +8,14 @@ import warp as wp
 from . import cg, triangular
 from ._operator import allocate
 from ._torch import torch_stream
+from .cg import System, block_dim, view
 from .factor import Factor
 from .poisson_kernels import phi_adjoint, place, place_adjoint, right_hand_side
 
 ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
 
-# The tensors of a solver travel through the operators as one list, in this order; cg.System and Factor follow.
+# The tensors of a solver travel through the operators as one list, in this order; System and Factor follow.
 MODEL = (
     ("rest_vertices", wp.vec3),
     ("faces", wp.int32),
@@ -33,23 +34,23 @@ MODEL = (
     ("tolerance", None),
 )
 _SYSTEM = len(MODEL)
-_FACTOR = _SYSTEM + len(cg.System._fields)
+_FACTOR = _SYSTEM + len(System._fields)
 
 
 def _views(model: list[torch.Tensor]) -> dict[str, object]:
     names = zip(MODEL, model[:_SYSTEM], strict=True)
-    return {name: cg.view(tensor, dtype) for (name, dtype), tensor in names if dtype is not None}
+    return {name: view(tensor, dtype) for (name, dtype), tensor in names if dtype is not None}
 
 
 def _start_rows(model: list[torch.Tensor]) -> list[object]:
-    return [cg.view(tensor, wp.int32) for tensor in model[_SYSTEM : _SYSTEM + 2]]
+    return [view(tensor, wp.int32) for tensor in model[_SYSTEM : _SYSTEM + 2]]
 
 
 def _solve(
     model: list[torch.Tensor], rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """(L + W) D = g: directly where there is a factor, or else as `cg.solve`, which says what is returned."""
-    system, factor = cg.System(*model[_SYSTEM:_FACTOR]), Factor(*model[_FACTOR:])
+    system, factor = System(*model[_SYSTEM:_FACTOR]), Factor(*model[_FACTOR:])
     tensors = _named(model)
     if int(factor.counts[1]):
         load = factor.without(rhs, tensors["vertex_component"])
@@ -92,17 +93,17 @@ def poisson_solve(
             right_hand_side,
             dim=len(guess),
             inputs=[
-                cg.view(tensors["faces"], wp.vec3i),
-                cg.view(tensors["half_cotangent"], wp.vec3d),
+                view(tensors["faces"], wp.vec3i),
+                view(tensors["half_cotangent"], wp.vec3d),
                 m["corner_start"],
                 m["corners"],
                 m["corner_edge"],
                 m["pin_of_vertex"],
                 m["pin_stiffness"],
-                cg.view(phi, wp.mat33),
-                cg.view(guess, wp.vec3d),
-                cg.view(pin_target, wp.vec3),
-                cg.view(rhs, wp.vec3d),
+                view(phi, wp.mat33),
+                view(guess, wp.vec3d),
+                view(pin_target, wp.vec3),
+                view(rhs, wp.vec3d),
             ],
             device=device,
         )
@@ -114,12 +115,12 @@ def poisson_solve(
                 *_start_rows(model),
                 m["kind"],
                 m["centroid_weight"],
-                cg.view(guess, wp.vec3d),
-                cg.view(increment, wp.vec3d),
-                cg.view(mean, wp.vec3),
-                cg.view(vertices, wp.vec3),
+                view(guess, wp.vec3d),
+                view(increment, wp.vec3d),
+                view(mean, wp.vec3),
+                view(vertices, wp.vec3),
             ],
-            block_dim=cg.block_dim(phi.device, len(guess), count),
+            block_dim=block_dim(phi.device, len(guess), count),
             device=device,
         )
     return vertices, report, error
@@ -155,11 +156,11 @@ def poisson_solve_backward(
                 *_start_rows(model),
                 m["kind"],
                 m["centroid_weight"],
-                cg.view(grad_vertices, wp.vec3),
-                cg.view(rhs, wp.vec3d),
-                cg.view(grad_mean, wp.vec3),
+                view(grad_vertices, wp.vec3),
+                view(rhs, wp.vec3d),
+                view(grad_mean, wp.vec3),
             ],
-            block_dim=cg.block_dim(mean.device, len(rhs), count),
+            block_dim=block_dim(mean.device, len(rhs), count),
             device=device,
         )
         exactly = torch.zeros_like(tensors["tolerance"])
@@ -171,8 +172,8 @@ def poisson_solve_backward(
                 m["rest_vertices"],
                 m["faces"],
                 m["half_cotangent"],
-                cg.view(adjoint, wp.vec3d),
-                cg.view(grad_phi, wp.float32),
+                view(adjoint, wp.vec3d),
+                view(grad_phi, wp.float32),
             ],
             device=device,
         )

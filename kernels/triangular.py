@@ -10,7 +10,7 @@ order, with a fourth number that is zero, since four doubles fit a vector regist
 | symbol | code | what |
 | --- | --- | --- |
 | b, x | `rhs, solution` | [V,3], float64 |
-| `start, rows` | as in cg.System | vertices sorted by component |
+| `start, rows` | as in System | vertices sorted by component |
 | the rest | as in factor.Factor | |
 """
 
@@ -19,9 +19,9 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from . import cg
 from ._operator import allocate
 from ._torch import torch_stream
+from .cg import System, block_dim, block_sum, view
 from .factor import Factor
 
 LANES = 32
@@ -174,7 +174,7 @@ def multiply_lower(
         while e < pointer[k + 1]:
             s += value[e] * rhs[rows[first + order[b + column[e]]]]
             e += wp.block_dim()
-        s = wp.vec3d(cg.block_sum(s[0]), cg.block_sum(s[1]), cg.block_sum(s[2]))
+        s = wp.vec3d(block_sum(s[0]), block_sum(s[1]), block_sum(s[2]))
         if lane == 0:
             x[place] = pivot[k] * (s + rhs[rows[first + order[k]]])
 
@@ -207,13 +207,13 @@ def multiply_upper(
         while e < pointer[k + 1]:
             s += value[e] * x[first + column[e]]
             e += wp.block_dim()
-        s = wp.vec3d(cg.block_sum(s[0]), cg.block_sum(s[1]), cg.block_sum(s[2]))
+        s = wp.vec3d(block_sum(s[0]), block_sum(s[1]), block_sum(s[2]))
         if lane == 0:
             solution[rows[first + order[k]]] = s + x[place]
 
 
 def solve(
-    system: cg.System,
+    system: System,
     factor: Factor,
     vertex_component: torch.Tensor,
     rhs: torch.Tensor,
@@ -230,27 +230,27 @@ def solve(
     """
     if len(rhs) == 0 or not int(factor.counts[0]):
         return
-    common = [cg.view(system.start, wp.int32), cg.view(system.rows, wp.int32)]
-    load, result = cg.view(rhs, wp.vec3d), cg.view(solution, wp.vec3d)
+    common = [view(system.start, wp.int32), view(system.rows, wp.int32)]
+    load, result = view(rhs, wp.vec3d), view(solution, wp.vec3d)
     with torch_stream(rhs.device) as device:
         if not int(factor.counts[2]):
             scratch = allocate((int(factor.counts[3]), 4), torch.float64, rhs.device)
-            inputs = [*common, *substitution(factor), load, cg.view(scratch, wp.vec4d), result]
+            inputs = [*common, *substitution(factor), load, view(scratch, wp.vec4d), result]
             wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
             return
-        base, order = cg.view(factor.base, wp.int32), cg.view(factor.order, wp.int32)
+        base, order = view(factor.base, wp.int32), view(factor.order, wp.int32)
         columns, rows = (
-            [cg.view(pointer, wp.int32), cg.view(column, wp.int32), cg.view(value, wp.float64)]
+            [view(pointer, wp.int32), view(column, wp.int32), view(value, wp.float64)]
             for pointer, column, value in (
                 (factor.pointer, factor.column, factor.value),
                 (factor.row_pointer, factor.row_column, factor.row_value),
             )
         )
-        common += [cg.view(vertex_component, wp.int32), base, order]
+        common += [view(vertex_component, wp.int32), base, order]
         scratch = allocate(rhs.shape, torch.float64, rhs.device)
-        work = cg.view(scratch, wp.vec3d)
-        block = LANES if rhs.is_cuda else cg.block_dim(rhs.device, len(rhs), 1)
-        first = [*common, cg.view(factor.pivot, wp.float64), *rows, load, work]
+        work = view(scratch, wp.vec3d)
+        block = LANES if rhs.is_cuda else block_dim(rhs.device, len(rhs), 1)
+        first = [*common, view(factor.pivot, wp.float64), *rows, load, work]
         second = [*common, *columns, work, result]
         wp.launch_tiled(multiply_lower, dim=[len(rhs)], inputs=first, block_dim=block, device=device)
         wp.launch_tiled(multiply_upper, dim=[len(rhs)], inputs=second, block_dim=block, device=device)
@@ -258,12 +258,12 @@ def solve(
 
 def substitution(factor: Factor) -> list[object]:
     """A factor in the form for substitution as launch arguments, `base` to `value` of `substitute`."""
-    integers = [cg.view(t, wp.int32) for t in (factor.base, factor.first, factor.order)]
+    integers = [view(t, wp.int32) for t in (factor.base, factor.first, factor.order)]
     return [
         *integers,
-        cg.view(factor.pivot.view(-1, 4), wp.vec4d),
-        cg.view(factor.triangle, wp.mat44d),
-        cg.view(factor.pointer, wp.int32),
-        cg.view(factor.column, wp.int32),
-        cg.view(factor.value.view(-1, 4), wp.vec4d),
+        view(factor.pivot.view(-1, 4), wp.vec4d),
+        view(factor.triangle, wp.mat44d),
+        view(factor.pointer, wp.int32),
+        view(factor.column, wp.int32),
+        view(factor.value.view(-1, 4), wp.vec4d),
     ]

@@ -19,9 +19,9 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from . import cg
 from ._operator import allocate
 from ._torch import torch_stream
+from .cg import System, view
 from .compliance import Compliance
 
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
@@ -189,7 +189,7 @@ def wide_contacts(
 
 
 def solve(
-    system: cg.System,
+    system: System,
     model: Compliance,
     normal: torch.Tensor,
     gap: torch.Tensor,
@@ -209,33 +209,33 @@ def solve(
     force = torch.zeros(vertices, dtype=torch.float64, device=device)
 
     def of_16(tensor: torch.Tensor) -> object:
-        return cg.view(tensor.view(-1, 16), vec16)
+        return view(tensor.view(-1, 16), vec16)
 
     with torch_stream(device) as warp_device:
         wp.launch(
             wide_contacts,
             dim=len(model.base),
             inputs=[
-                cg.view(system.start, wp.int32),
-                cg.view(system.rows, wp.int32),
-                cg.view(model.base, wp.int64),
-                cg.view(model.room, wp.int64),
-                cg.view(model.wide, wp.int32),
-                cg.view(model.values, wp.float32),
+                view(system.start, wp.int32),
+                view(system.rows, wp.int32),
+                view(model.base, wp.int64),
+                view(model.room, wp.int64),
+                view(model.wide, wp.int32),
+                view(model.values, wp.float32),
                 of_16(model.values),
-                cg.view(normal, wp.vec3d),
-                cg.view(gap, wp.float64),
-                cg.view(tolerance, wp.float64),
+                view(normal, wp.vec3d),
+                view(gap, wp.float64),
+                view(tolerance, wp.float64),
                 float(relative),
                 int(max_iterations),
                 of_16(coupling),
-                cg.view(place, wp.int32),
+                view(place, wp.int32),
                 *(of_16(vector) for vector in wide),
-                *(cg.view(vector, wp.float64) for vector in scalars),
-                cg.view(force, wp.float64),
-                cg.view(increment, wp.vec3d),
-                cg.view(report, wp.int32),
-                cg.view(error, wp.float64),
+                *(view(vector, wp.float64) for vector in scalars),
+                view(force, wp.float64),
+                view(increment, wp.vec3d),
+                view(report, wp.int32),
+                view(error, wp.float64),
             ],
             device=warp_device,
         )
