@@ -24,11 +24,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.measure import RESULTS, Row, machine
+from benchmarks.networks import DEFAULT, named
 from warpgarment.io.atomic import atomic_files
 
 from . import batch, frames, manifold, report, roofline, stages, teacher
-from .measure import RESULTS, Row, machine
-from .networks import DEFAULT, named
 
 PARTS = ("geodesics", "stages", "batch", "roofline", "teacher", "profile")
 FACES = (500, 1000, 2000, 5000, 10000)

@@ -9,15 +9,14 @@ from unittest import mock
 
 import torch
 
+from benchmarks.measure import NO_GPU, Row, aimed_time, figures, interleaved
+from benchmarks.networks import Named
+from benchmarks.scenes import Dressed, dressed
 from warpgarment import memory
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.garment import Garment
 from warpgarment.simulator import Simulator
 from warpgarment.state import SimulationState
-
-from .measure import NO_GPU, Row, aimed_time, figures, interleaved
-from .networks import Named
-from .scenes import Dressed, dressed
 
 CPU_BATCH = (1, 2, 4, 8, 16)
 GPU_BATCH = (1, 4, 16, 64, 256, 1024, 4096)

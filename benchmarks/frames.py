@@ -10,14 +10,13 @@ import torch
 import warp as wp
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.batch import Rolling, scenes_of
+from benchmarks.measure import NO_GPU, Row, aimed
+from benchmarks.networks import Named
 from warpgarment.frame import advance
 from warpgarment.frame_graph import WARM_UP
-from warpgarment.kernels import cg
+from warpgarment.kernels.linear import conjugate_gradients
 from warpgarment.simulator import Simulator
-
-from .batch import Rolling, scenes_of
-from .measure import NO_GPU, Row, aimed
-from .networks import Named
 
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero"}  # the host waits for these
 VIEWS = {"view", "unsqueeze", "expand", "slice", "select", "t", "transpose", "split", "split_with_sizes", "alias"}
@@ -67,7 +66,9 @@ class FrameCounts:
             refit(mesh)
 
         patches.append(mock.patch.object(wp.Mesh, "refit", counted_refit))
-        patches.append(mock.patch.object(cg.Progress, "_warn", return_value=None))  # a CPU looks at reports at once
+        patches.append(
+            mock.patch.object(conjugate_gradients.Progress, "_warn", return_value=None)
+        )  # a CPU looks at reports at once
         try:
             for patch in patches:
                 patch.start()

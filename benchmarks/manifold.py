@@ -11,18 +11,18 @@ from unittest import mock
 import numpy as np
 import torch
 
+from benchmarks.measure import Call, Row, aimed, aimed_time, compared
+from benchmarks.scenes import remeshed
 from warpgarment.attention import ManifoldAwareAttention, geodesic_weights
 from warpgarment.batch import PackedGarments, padded_views
 from warpgarment.config import NetworkConfig
 from warpgarment.garment import KEPT, Garment
-from warpgarment.kernels.shortest_paths import usable_cores
+from warpgarment.kernels.mesh.shortest_paths import usable_cores
 from warpgarment.patches import PatchLayout
 from warpgarment.pooled_geodesics import CENTRES
 from warpgarment.pooled_weights import dense_weights, pooled_weights
 
 from . import exact
-from .measure import Call, Row, aimed, aimed_time, compared
-from .scenes import remeshed
 
 SOURCES = 4  # faces whose distances are held against exact ones
 ROWS = 64  # of the pooled weights that are held against dense ones

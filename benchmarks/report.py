@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .measure import Row
+from benchmarks.measure import Row
 
 TITLES = {
     "geodesics": "Distances over the cloth",

@@ -22,17 +22,16 @@ from collections.abc import Iterator, Sequence
 
 import torch
 
+from benchmarks.batch import scenes_of
+from benchmarks.measure import NO_GPU, Row, figures, interleaved
+from benchmarks.networks import Named
 from warpgarment.config import NetworkConfig
 from warpgarment.garment import POOLED
-from warpgarment.kernels.features import FEATURES
+from warpgarment.kernels.features.face import FEATURES
 from warpgarment.patches import SHARES, PatchLayout
 from warpgarment.pooled_geodesics import CENTRES, NEAR
 from warpgarment.simulator import Simulator
 from warpgarment.training.flops import forward_flops
-
-from .batch import scenes_of
-from .measure import NO_GPU, Row, figures, interleaved
-from .networks import Named
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 MATRIX = {"cpu": 1536, "cuda": 8192}

@@ -10,15 +10,14 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 import torch
 
+from benchmarks.measure import Call, Row, aimed, aimed_time, compared, tensor
+from benchmarks.scenes import Dressed
 from warpgarment.garment import Garment
 from warpgarment.kernels import deformation
-from warpgarment.kernels.body_meshes import BodyMeshes
-from warpgarment.kernels.collision import TOLERANCE, CollisionSolver
-from warpgarment.kernels.contacts import contacts
-from warpgarment.kernels.poisson import PoissonSolver
-
-from .measure import Call, Row, aimed, aimed_time, compared, tensor
-from .scenes import Dressed
+from warpgarment.kernels.collision.body_contacts import contacts
+from warpgarment.kernels.collision.solver import TOLERANCE, CollisionSolver
+from warpgarment.kernels.poisson.solver import PoissonSolver
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 NOT_INSTALLED = "not installed"
 EPSILON = 0.004  # metres kept from the body

@@ -8,14 +8,14 @@ import igl
 import numpy as np
 import torch
 
+from benchmarks.measure import Call, Row, aimed, aimed_time, compared, tensor
+from benchmarks.scenes import Dressed, dressed
 from warpgarment.kernels import deformation
-from warpgarment.kernels.body_meshes import BodyMeshes
-from warpgarment.kernels.features import body_interaction, face_features
-from warpgarment.kernels.frame_features import frame_features
+from warpgarment.kernels.features.face import body_interaction, face_features
+from warpgarment.kernels.features.frame_features import frame_features
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from . import exact, manifold, solves
-from .measure import Call, Row, aimed, aimed_time, compared, tensor
-from .scenes import Dressed, dressed
 
 SAMPLE = 256  # points whose distances are held against brute force
 LARGEST = 50_000  # faces up to which the Poisson solve is promised

@@ -24,14 +24,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.batch import Rolling, scenes_of
+from benchmarks.measure import RESULTS, Row, figures, interleaved, machine
+from benchmarks.networks import Named
+from benchmarks.scenes import dressed
 from warpgarment.io.atomic import atomic_files
 from warpgarment.simulator import Simulator
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, TeacherError, make_teacher
-
-from .batch import Rolling, scenes_of
-from .measure import RESULTS, Row, figures, interleaved, machine
-from .networks import Named
-from .scenes import dressed
 
 WORLDS = {"cpu": (1, 4), "cuda": (1, 4, 16, 64, 256, 1024)}
 STARTS = 24  # frames of the walk that worlds start at

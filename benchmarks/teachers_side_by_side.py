@@ -24,6 +24,7 @@ import igl
 import numpy as np
 import torch
 
+from benchmarks.measure import machine
 from warpgarment import demo, draw
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
@@ -31,8 +32,6 @@ from warpgarment.metrics import layer_collision
 from warpgarment.motion import GarmentMotion
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, make_teacher
 from warpgarment.training.teachers.checks import hanging_strip, pendulum, rest_on_sphere
-
-from .measure import machine
 
 RESULTS = Path(__file__).parent / "results"
 WIDER = 0.020  # gap between the T-shirt and the one over it [m]

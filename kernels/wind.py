@@ -26,8 +26,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from ._operator import allocate
-from ._torch import as_warp, expect, torch_stream
+from .launch import as_warp, expect, torch_stream
+from .operator import allocate
 
 AIR_DENSITY = 1.225
 """Of air at sea level and 15 °C [kg/m^3]."""

@@ -7,8 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from warpgarment.kernels import _torch
-from warpgarment.kernels._torch import as_argument
+from warpgarment.kernels import launch
+from warpgarment.kernels.launch import as_argument
 
 
 @wp.kernel(enable_backward=False)
@@ -53,4 +53,4 @@ def test_memory_is_given_back_and_few_are_remembered(monkeypatch):
     kept = [torch.zeros(n) for n in range(1, 20)]
     for tensor in kept:
         as_argument(tensor, wp.float32)
-        assert 0 < len(_torch._descriptors) <= 8
+        assert 0 < len(launch._descriptors) <= 8

@@ -14,7 +14,7 @@ import warp as wp
 from warpgarment import draw
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
-from warpgarment.kernels import raster, shading
+from warpgarment.kernels.render import raster, shading
 from warpgarment.motion import GarmentMotion
 
 SIZE = 48

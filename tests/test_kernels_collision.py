@@ -10,8 +10,10 @@ import warp as wp
 from poison import poison_outputs
 from reference import collision as reference
 
-from warpgarment.kernels import cg, collision, compliance
-from warpgarment.kernels.body_meshes import BodyMeshes
+from warpgarment.kernels import collision
+from warpgarment.kernels.collision import compliance
+from warpgarment.kernels.linear import conjugate_gradients
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 EPSILON = 0.004
 TOLERANCE = 2e-5
@@ -156,7 +158,7 @@ def test_packed_batch_is_the_garments_one_by_one(one_core):
 
 def inverted(solver: collision.CollisionSolver) -> list[int]:
     """Where the inverse of each component begins; -1 without one."""
-    return solver._model[len(cg.System._fields)].tolist()
+    return solver._model[len(conjugate_gradients.System._fields)].tolist()
 
 
 def test_budgets_are_kept():

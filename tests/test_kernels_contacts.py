@@ -8,14 +8,14 @@ import torch
 from poison import poison_outputs
 from reference import collision as reference
 
-from warpgarment.kernels.body_meshes import BodyMeshes
-from warpgarment.kernels.carried import carried, face_at_each_vertex
-from warpgarment.kernels.collision import CollisionSolver
-from warpgarment.kernels.contacts import contacts
-from warpgarment.kernels.deformation import inverse_rest_frames
-from warpgarment.kernels.face_means import FaceMeans
-from warpgarment.kernels.features import LAYOUT
-from warpgarment.kernels.frame_features import frame_features
+from warpgarment.kernels.collision.body_contacts import contacts
+from warpgarment.kernels.collision.solver import CollisionSolver
+from warpgarment.kernels.deformation.face_means import FaceMeans
+from warpgarment.kernels.deformation.gradients import inverse_rest_frames
+from warpgarment.kernels.features.carry import carried, face_at_each_vertex
+from warpgarment.kernels.features.face import LAYOUT
+from warpgarment.kernels.features.frame_features import frame_features
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 EPSILON = 0.004
 

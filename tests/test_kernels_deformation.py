@@ -10,7 +10,7 @@ from reference import deformation as reference
 from reference.finite_differences import numeric_gradient
 
 from warpgarment.kernels import deformation
-from warpgarment.kernels.singular_values import MAX_GAIN
+from warpgarment.kernels.deformation.svd import MAX_GAIN
 
 GARMENTS = meshes.garments()
 

@@ -8,7 +8,8 @@ import warp as wp
 from poison import poison_outputs
 from reference import signed_distance as reference
 
-from warpgarment.kernels import inside, sdf
+from warpgarment.kernels import sdf
+from warpgarment.kernels.sdf import inside
 
 OPEN_TETRAHEDRON = meshes.Mesh(meshes.tetrahedron().vertices, meshes.tetrahedron().faces[1:])
 

@@ -9,8 +9,9 @@ from poison import poison_outputs
 from reference.nearest_face import nearest_face
 from test_kernels_sdf import points_around
 
-from warpgarment.kernels import closest, features, sdf
-from warpgarment.kernels import nearest_face as kernel
+from warpgarment.kernels import features, sdf
+from warpgarment.kernels.sdf import closest
+from warpgarment.kernels.sdf import nearest_face as kernel
 
 
 def three_on_an_edge() -> meshes.Mesh:

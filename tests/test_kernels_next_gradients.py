@@ -8,8 +8,8 @@ from poison import poison_outputs
 from reference import deformation as reference
 
 from warpgarment.kernels import deformation
-from warpgarment.kernels.face_means import FaceMeans
-from warpgarment.kernels.next_gradients import next_gradients
+from warpgarment.kernels.deformation.face_means import FaceMeans
+from warpgarment.kernels.deformation.next_frame import next_gradients
 
 
 @pytest.fixture(autouse=True)

@@ -13,8 +13,9 @@ import warp as wp
 from poison import poison_outputs
 from reference import poisson as reference
 
-from warpgarment.kernels import cg, factor, laplacian
-from warpgarment.kernels.poisson import PoissonSolver
+from warpgarment.kernels.linear import conjugate_gradients, factor
+from warpgarment.kernels.mesh import laplacian
+from warpgarment.kernels.poisson.solver import PoissonSolver
 
 GARMENTS = {
     **meshes.garments(),
@@ -190,7 +191,7 @@ def test_a_good_guess_saves_iterations():
     first = solver.solve(torch.tensor(phi), torch.tensor(mean))
     cold = solver.iterations
     solver.solve(torch.tensor(phi), torch.tensor(mean), initial=first)
-    assert solver.iterations <= 2 * cg.WINDOW < cold
+    assert solver.iterations <= 2 * conjugate_gradients.WINDOW < cold
 
 
 @pytest.mark.parametrize("way", SOLVERS)
@@ -294,7 +295,7 @@ def test_a_factor_that_cannot_be_trusted_is_not_used():
     rest = meshes.irregular_grid(9, 7)
     matrix = laplacian.cotangent_laplacian(rest.vertices, rest.faces)
     count, largest = len(rest.vertices), matrix.diagonal().max()
-    system = cg.System.build(matrix, np.zeros(count, np.int32), 1, "cpu")
+    system = conjugate_gradients.System.build(matrix, np.zeros(count, np.int32), 1, "cpu")
 
     def factored(ground):
         return factor.Factor.build((matrix + ground * sparse.identity(count)).tocsr(), system, explicit=False)
@@ -314,7 +315,7 @@ def test_factor_is_that_of_the_matrix(flat):
     matrix = laplacian.cotangent_laplacian(regular if flat else rest.vertices, rest.faces)
     count = len(rest.vertices)
     matrix = (matrix + 0.1 * sparse.identity(count)).tocsr()
-    system = cg.System.build(matrix, np.zeros(count, np.int32), 1, "cpu")
+    system = conjugate_gradients.System.build(matrix, np.zeros(count, np.int32), 1, "cpu")
     for explicit in (False, True):
         built = factor.Factor.build(matrix, system, explicit=explicit)
         order, places = built.order.numpy(), len(built.order)

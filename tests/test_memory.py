@@ -13,9 +13,9 @@ from test_simulator import network, skirt, tube, walk
 from warpgarment import memory
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.garment import Garment
-from warpgarment.kernels.collision_operator import _parts as parts
-from warpgarment.kernels.factor import Factor
-from warpgarment.kernels.poisson import PoissonSolver
+from warpgarment.kernels.collision.operator import _parts as parts
+from warpgarment.kernels.linear.factor import Factor
+from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.network import NetworkConfig, build_network
 from warpgarment.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
 from warpgarment.simulator import Simulator

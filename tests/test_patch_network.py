@@ -18,7 +18,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
 from warpgarment.garment import Garment
-from warpgarment.kernels.features import FEATURES
+from warpgarment.kernels.features.face import FEATURES
 from warpgarment.network import (
     STATISTICS,
     ManifoldAwareTransformer,

@@ -7,8 +7,8 @@ from scipy.sparse import coo_matrix
 from test_geodesics import flat, irregular, skirt
 
 from warpgarment.geodesics import checked_mesh, face_geodesics, local_geodesics, surface_graph
-from warpgarment.kernels import shortest_paths
-from warpgarment.kernels.shortest_paths import Paths
+from warpgarment.kernels.mesh import shortest_paths
+from warpgarment.kernels.mesh.shortest_paths import Paths
 
 
 def pieces():

@@ -17,7 +17,7 @@ from warpgarment.batch import PackedGarments, padded_views
 from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
 from warpgarment.garment import Garment
-from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 from warpgarment.pins import BodyPins, barycentric_coordinates
 from warpgarment.simulator import Simulator

@@ -12,8 +12,8 @@ from test_simulator import network
 from warpgarment import scene
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
-from warpgarment.kernels.body_meshes import BodyMeshes
-from warpgarment.kernels.surface_depth import surface_depth
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.kernels.sdf.surface_depth import surface_depth
 from warpgarment.simulator import Simulator
 from warpgarment.surface import AMPLE, distance_to_keep
 

@@ -7,7 +7,7 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from warpgarment.kernels.features import FEATURES
+from warpgarment.kernels.features.face import FEATURES
 from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
 from warpgarment.training.flops import forward_flops, peak_of, step_flops
 from warpgarment.training.rate import Rate, spelt

@@ -10,9 +10,9 @@ import pytest
 import synthetic_sequences
 import torch
 
-from warpgarment.kernels.deformation import deformation_gradient
-from warpgarment.kernels.features import FEATURES, LAYOUT, body_interaction, face_features
-from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.kernels.deformation.gradients import deformation_gradient
+from warpgarment.kernels.features.face import FEATURES, LAYOUT, body_interaction, face_features
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.network import (
     ManifoldAwareTransformer,
     NetworkConfig,

@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import torch
 
-from warpgarment.kernels.features import FEATURES, LAYOUT
+from warpgarment.kernels.features.face import FEATURES, LAYOUT
 from warpgarment.parametrisation import NetworkOutput
 
 LARGEST_SCALE = 0.1

@@ -23,8 +23,8 @@ from trimesh.triangles import closest_point, points_to_barycentric
 
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
-from warpgarment.kernels.deformation import deformation_gradient, rotation
-from warpgarment.kernels.laplacian import components
+from warpgarment.kernels.deformation.gradients import deformation_gradient, rotation
+from warpgarment.kernels.mesh.laplacian import components
 
 NEIGHBOURS = 8
 SMOOTHING = 0.03  # metres

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgarment.training.teachers.newton_vbd import NewtonTeacher
+
 from .bodies import anny_bodies
 from .garments import Pattern, make_garment
 from .procedural import procedural
 from .quality import QualityGate
 from .skeleton import arms_abducted, blended_in, facing_forward, posed
 from .teachers import Cloth, ClothScene
-from .teachers.newton_vbd import NewtonTeacher
 
 FPS, BLEND, FRAMES, SEED = 30.0, 20, 130, 2026
 PHENOTYPE = {"gender": 0.9, "age": 0.68, "muscle": 0.5, "weight": 0.45, "height": 0.5, "proportions": 0.7}

@@ -40,7 +40,8 @@ from warpgarment.training.tables.protocol import (
     plain,
     skipped_lines,
 )
-from warpgarment.training.training_set import folders_of
+
+from .training_set import folders_of
 
 
 class NoTestData(ValueError):
@@ -104,7 +105,7 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
     if config.picture:
         _pyplot()
     if config.table is not None:
-        from warpgarment.training.tables import make_table
+        from .tables import make_table
 
         return make_table(config)
     for name in ("data", "out"):

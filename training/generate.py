@@ -202,7 +202,7 @@ def generate(config: GenerateConfig) -> Path:
 
     config = replace(config, out=Path(config.out), motions=Path(config.motions) if config.motions else None)
     if config.make_blender:
-        from .teachers.blender_environment import make_environment
+        from warpgarment.training.teachers.blender_environment import make_environment
 
         make_environment()
     if config.bodies == "anny":

@@ -28,9 +28,9 @@ import numpy as np
 import torch
 
 import warpgarment
-from warpgarment.kernels.deformation import face_centroids
-from warpgarment.kernels.features import BodyInteraction, body_interaction
-from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.kernels.deformation.gradients import face_centroids
+from warpgarment.kernels.features.face import BodyInteraction, body_interaction
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
 WIDTH = 16
@@ -163,7 +163,7 @@ def cached(
 
 def main(arguments: list[str]) -> None:
     """Fills the cache of a data folder; prints one line per sequence that cannot be used."""
-    from warpgarment.training.dataset import Sequence, list_sequences
+    from .dataset import Sequence, list_sequences
 
     data = Path(arguments[0])
     cache = Path(arguments[1]) if len(arguments) > 1 else default_cache(data)

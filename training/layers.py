@@ -16,7 +16,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from warpgarment.garment import Garment
-from warpgarment.kernels import _torch  # noqa: F401  (quietens Warp)
+from warpgarment.kernels import launch  # noqa: F401  (quietens Warp)
 
 REACH = 0.03
 _MILLIMETRES = wp.constant(wp.float64(1e3))

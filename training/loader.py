@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 
-from warpgarment.training.pushforward import Pool
-from warpgarment.training.samples import Batch, SampleBuilder
+from .pushforward import Pool
+from .samples import Batch, SampleBuilder
 
 
 class Plan:

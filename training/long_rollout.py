@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
-from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from .baselines import kabsch
 

@@ -15,11 +15,12 @@ from torch.nn.parallel import DistributedDataParallel
 from warpgarment.network import GarmentNetwork
 from warpgarment.parametrisation import NetworkOutput
 from warpgarment.patches import PatchLayout
-from warpgarment.training.distributed import Group
-from warpgarment.training.losses import LossConfig, loss
-from warpgarment.training.samples import Batch
-from warpgarment.training.unroll import UnrolledObjective
-from warpgarment.training.unroll_samples import UnrolledBatch
+
+from .distributed import Group
+from .losses import LossConfig, loss
+from .samples import Batch
+from .unroll import UnrolledObjective
+from .unroll_samples import UnrolledBatch
 
 
 class CompileFailed(RuntimeError):

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgarment.training.distributed import Group
-from warpgarment.training.rollouts import predict
+from .distributed import Group
+from .rollouts import predict
 
 
 @dataclass(frozen=True)

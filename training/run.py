@@ -14,19 +14,20 @@ from tqdm import tqdm
 
 from warpgarment import checkpoint
 from warpgarment.metrics import mean_vertex_error
-from warpgarment.training import state as training_state
-from warpgarment.training.distributed import Group
-from warpgarment.training.loader import Loader, Plan
-from warpgarment.training.objective import Objective, Trainer
-from warpgarment.training.pushforward import Pool
-from warpgarment.training.rate import Rate, spelt
-from warpgarment.training.rollouts import predict
-from warpgarment.training.run_log import RunLog, json_number
-from warpgarment.training.samples import Batch, SampleBuilder
-from warpgarment.training.statistics import statistics
-from warpgarment.training.train_config import TrainConfig
-from warpgarment.training.unroll import UnrolledObjective
-from warpgarment.training.unroll_samples import UnrolledBatch, UnrolledBuilder
+
+from . import state as training_state
+from .distributed import Group
+from .loader import Loader, Plan
+from .objective import Objective, Trainer
+from .pushforward import Pool
+from .rate import Rate, spelt
+from .rollouts import predict
+from .run_log import RunLog, json_number
+from .samples import Batch, SampleBuilder
+from .statistics import statistics
+from .train_config import TrainConfig
+from .unroll import UnrolledObjective
+from .unroll_samples import UnrolledBatch, UnrolledBuilder
 
 STATE = "state.safetensors"
 SHARED_OUT = "All machines must see the same out folder."

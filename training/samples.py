@@ -25,19 +25,20 @@ import torch
 
 from warpgarment.config import NetworkConfig
 from warpgarment.heading import rotation_about_up
-from warpgarment.kernels.deformation import (
+from warpgarment.kernels.deformation.gradients import (
     deformation_gradient_from_inverse,
     relative_deformation_gradient,
     singular_values,
 )
-from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
 from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.patches import Patches, PatchLayout, patch_layout
-from warpgarment.training.augmentation import Augmentation, mirror
-from warpgarment.training.flops import step_flops
-from warpgarment.training.interactions import COLUMNS, unpack
-from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.sequence_data import SequenceData
+
+from .augmentation import Augmentation, mirror
+from .flops import step_flops
+from .interactions import COLUMNS, unpack
+from .noise import NoiseConfig
+from .sequence_data import SequenceData
 
 __all__ = ["Augmentation", "Batch", "SampleBuilder", "SequenceData", "mirror"]
 

@@ -11,12 +11,13 @@ import torch
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
 from warpgarment.heading import yaw
-from warpgarment.kernels.deformation import deformation_gradient_from_inverse, inverse_rest_frames
-from warpgarment.kernels.laplacian import components
+from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, inverse_rest_frames
+from warpgarment.kernels.mesh.laplacian import components
 from warpgarment.patches import Patches, garment_patches, patches
 from warpgarment.pooled_weights import dense_weights
-from warpgarment.training.interactions import COLUMNS, UnusableSequence, cached
-from warpgarment.training.noise import NoiseBasis
+
+from .interactions import COLUMNS, UnusableSequence, cached
+from .noise import NoiseBasis
 
 
 class SequenceData:

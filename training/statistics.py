@@ -6,9 +6,10 @@ from collections.abc import Iterable
 
 import torch
 
-from warpgarment.kernels.features import FEATURES
+from warpgarment.kernels.features.face import FEATURES
 from warpgarment.network import GarmentNetwork
-from warpgarment.training.samples import Batch
+
+from .samples import Batch
 
 FLOORS = {"feature": 3e-3, "velocity": 1e-3, "psi": 1e-3, "singular_value": 1e-3, "q": 3e-4}
 

@@ -26,16 +26,17 @@ import torch
 from warpgarment import checkpoint
 from warpgarment.io.atomic import atomic_file
 from warpgarment.network import ManifoldAwareTransformer, PatchTransformer, build_network
-from warpgarment.training.distributed import Group, GroupError
-from warpgarment.training.grow import grow
-from warpgarment.training.loader import Plan
-from warpgarment.training.objective import CompileFailed
-from warpgarment.training.rate import spelt
-from warpgarment.training.run import STATE, NonFiniteLoss, Run
-from warpgarment.training.run_log import say
-from warpgarment.training.samples import SampleBuilder
-from warpgarment.training.train_config import TrainConfig
-from warpgarment.training.training_set import NoTrainingData, load_sequences, load_validation, report
+
+from .distributed import Group, GroupError
+from .grow import grow
+from .loader import Plan
+from .objective import CompileFailed
+from .rate import spelt
+from .run import STATE, NonFiniteLoss, Run
+from .run_log import say
+from .samples import SampleBuilder
+from .train_config import TrainConfig
+from .training_set import NoTrainingData, load_sequences, load_validation, report
 
 __all__ = ["CompileFailed", "GroupError", "NoTrainingData", "NonFiniteLoss", "Run", "TrainConfig", "train"]
 

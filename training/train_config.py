@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Literal
 
 from warpgarment.network import NetworkConfig
-from warpgarment.training.augmentation import Augmentation
-from warpgarment.training.losses import LossConfig
-from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.pushforward import PushforwardConfig
-from warpgarment.training.unroll import UnrollConfig
+
+from .augmentation import Augmentation
+from .losses import LossConfig
+from .noise import NoiseConfig
+from .pushforward import PushforwardConfig
+from .unroll import UnrollConfig
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ from tqdm import tqdm
 from warpgarment.body import BodyMotion
 from warpgarment.config import NetworkConfig
 from warpgarment.errors import MeshError
-from warpgarment.training.dataset import Sequence, list_sequences, read_manifest
-from warpgarment.training.distributed import Group
-from warpgarment.training.interactions import cached, default_cache
-from warpgarment.training.sequence_data import SequenceData
-from warpgarment.training.train_config import TrainConfig
+
+from .dataset import Sequence, list_sequences, read_manifest
+from .distributed import Group
+from .interactions import cached, default_cache
+from .sequence_data import SequenceData
+from .train_config import TrainConfig
 
 SAME_DATA = "All machines must see the same data folder; compare it with `warpgarment dataset verify`."
 

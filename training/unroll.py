@@ -33,17 +33,18 @@ from torch import nn
 
 from warpgarment.batch import PaddedView
 from warpgarment.heading import canonical_frame
-from warpgarment.kernels.deformation import (
+from warpgarment.kernels.deformation.gradients import (
     deformation_gradient_from_inverse,
     relative_deformation_gradient,
     singular_values,
 )
-from warpgarment.kernels.features import LAYOUT
+from warpgarment.kernels.features.face import LAYOUT
 from warpgarment.network import ManifoldAwareTransformer, NetworkOutput, rotate_output
 from warpgarment.parametrisation import Step, compose, context, targets
-from warpgarment.training.augmentation import mirror
-from warpgarment.training.losses import LossConfig, weighted
-from warpgarment.training.unroll_samples import UnrolledBatch, turned
+
+from .augmentation import mirror
+from .losses import LossConfig, weighted
+from .unroll_samples import UnrolledBatch, turned
 
 MOST_STEPS = 8
 

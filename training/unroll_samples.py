@@ -16,17 +16,18 @@ from warpgarment.batch import PackedBodies
 from warpgarment.config import NetworkConfig
 from warpgarment.heading import rotation_about_up
 from warpgarment.history import History
-from warpgarment.kernels.deformation import face_centroids, segment_mean
-from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
+from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
 from warpgarment.network import ManifoldAwareTransformer
 from warpgarment.scene import Scene
 from warpgarment.timing import Timings
-from warpgarment.training.augmentation import Augmentation
-from warpgarment.training.flops import step_flops
-from warpgarment.training.interactions import COLUMNS, unpack
-from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.samples import SampleBuilder
-from warpgarment.training.sequence_data import SequenceData
+
+from .augmentation import Augmentation
+from .flops import step_flops
+from .interactions import COLUMNS, unpack
+from .noise import NoiseConfig
+from .samples import SampleBuilder
+from .sequence_data import SequenceData
 
 _VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpgarment.errors import MeshError
-from warpgarment.garment import Garment
+from .errors import MeshError
+from .garment import Garment
 
 
 def as_array(values: Any) -> np.ndarray:

@@ -13,13 +13,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from warpgarment.garment import Garment
-from warpgarment.kernels.laplacian import components
-from warpgarment.network import NetworkConfig, geodesic_weights
-from warpgarment.parametrisation import NetworkOutput
-from warpgarment.patches import PatchLayout, garment_patches, patch_layout
-from warpgarment.pooled_geodesics import CENTRES
-from warpgarment.pooled_weights import PooledWeights, pooled_weights
+from warpgarment.kernels.mesh.laplacian import components
+
+from .garment import Garment
+from .network import NetworkConfig, geodesic_weights
+from .parametrisation import NetworkOutput
+from .patches import PatchLayout, garment_patches, patch_layout
+from .pooled_geodesics import CENTRES
+from .pooled_weights import PooledWeights, pooled_weights
 
 TOKENS_PER_VIEW = 131_072  # faces in one call of the network: bounds its activations to a few GB
 WEIGHTS_PER_VIEW = 2**30  # entries of geodesic weights in one call: 4 GB

@@ -86,7 +86,7 @@ class BodyMotion:
             MeshError: The file is not of its kind or truncated, arrays do not fit each other, or as the constructor.
             FileNotFoundError: There is no such file.
         """
-        from .io.sequence import read_sequence
+        from warpgarment.io.sequence import read_sequence
 
         path = Path(path)
         data = read_sequence(path, unit=unit, mesh=mesh)
@@ -99,7 +99,7 @@ class BodyMotion:
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes .npz, .usd (.usda, .usdc), .pc2 with .obj beside it, or a folder of .obj; completely or not at all."""
-        from .io.sequence import write_sequence
+        from warpgarment.io.sequence import write_sequence
 
         write_sequence(Path(path), self.vertices, self.faces, self.fps, name=Path(path).stem or "body")
 

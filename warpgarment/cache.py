@@ -16,7 +16,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from .io.atomic import atomic_file
+from warpgarment.io.atomic import atomic_file
 
 OFF = "WARPGARMENT_NO_CACHE"
 LARGEST = 2**29  # bytes of arrays that are kept, for one key

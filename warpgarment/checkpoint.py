@@ -17,10 +17,11 @@ from typing import Any
 import torch
 from safetensors.torch import save as serialise
 
-from warpgarment import hub, shards
-from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
-from warpgarment.network import STATISTICS, GarmentNetwork, NetworkConfig, build_network
+
+from . import hub, shards
+from .errors import CheckpointError
+from .network import STATISTICS, GarmentNetwork, NetworkConfig, build_network
 
 FORMAT = "warpgarment.network"
 FORMAT_VERSION = 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpgarment.garment import Garment
+from .garment import Garment
 
 CLOSEST = 0.004  # metres between a vertex and the body, at least
 CLEARANCE_PER_EDGE = 0.2  # ... and as a share of the mean edge length

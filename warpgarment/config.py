@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
-from warpgarment.attention import ACTIVATIONS
+from .attention import ACTIVATIONS
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgarment.io.usd import write_usd
+
 from . import draw, metrics
 from .body import BodyMotion
 from .errors import MeshError
 from .garment import Garment
-from .io.usd import write_usd
 from .motion import GarmentMotion
 from .report import rollout_table
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import torch
 
-from warpgarment.batch import PackedGarments
-from warpgarment.kernels.deformation import face_centroids, replace_singular_values, segment_mean
-from warpgarment.kernels.features import LAYOUT, body_interaction, face_features
-from warpgarment.kernels.sdf import BodyMeshes
-from warpgarment.parametrisation import Step
+from warpgarment.kernels.deformation.gradients import face_centroids, replace_singular_values, segment_mean
+from warpgarment.kernels.features.face import LAYOUT, body_interaction, face_features
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+
+from .batch import PackedGarments
+from .parametrisation import Step
 
 
 def components_mean(packed: PackedGarments, vertices: torch.Tensor) -> torch.Tensor:

@@ -127,7 +127,7 @@ def render(
     Returns:
         uint8 [height, width, 3].
     """
-    from .kernels import raster, shading
+    from warpgarment.kernels.render import raster, shading
 
     if not surfaces:
         raise ValueError("render was given no surface; pass at least one")
@@ -160,7 +160,7 @@ def render(
 
 def _lighting(camera: Camera, seen: np.ndarray, floor: float | None) -> tuple[Any, Any]:
     """A warm key light over the viewer's left shoulder, a cool fill from the right, and the key's shadow view."""
-    from .kernels import raster, shading
+    from warpgarment.kernels.render import raster, shading
 
     right, _, forward = camera.axes()
     back = -np.array([forward[0], 0.0, forward[2]])

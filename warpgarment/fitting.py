@@ -10,11 +10,12 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from warpgarment.kernels.mesh.laplacian import half_cotangents
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+
 from .body import BodyMotion
 from .errors import MeshError
 from .garment import Garment
-from .kernels.laplacian import half_cotangents
-from .kernels.sdf import BodyMeshes
 from .mesh_checks import checked_faces, checked_positions, to_numpy
 
 NEAREST = 48  # body faces that a garment vertex listens to

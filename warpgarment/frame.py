@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from warpgarment.history import History
-from warpgarment.scene import Scene
-from warpgarment.status import RolloutStatus
+from .history import History
+from .scene import Scene
+from .status import RolloutStatus
 
 READ_EVERY = 16  # frames of a rollout that a GPU computes before the host looks at them
 

@@ -20,8 +20,8 @@ import torch
 import warp as wp
 
 if TYPE_CHECKING:
-    from warpgarment.scene import Scene
-    from warpgarment.state import Frame
+    from .scene import Scene
+    from .state import Frame
 
 WARM_UP = 3  # frames
 
@@ -32,7 +32,7 @@ Record = Callable[[Callable[[], "Frame"]], "tuple[Frame, Callable[[], None]]"]
 def cuda_graph(run: Callable[[], Frame]) -> tuple[Frame, Callable[[], None]]:
     """Records a call as a CUDA graph without running it.
 
-    Warp launches on torch's current stream (`kernels/_torch.py`), which is the stream being captured; Warp is told of
+    Warp launches on torch's current stream (`kernels/launch.py`), which is the stream being captured; Warp is told of
     the capture so that it keeps the modules of its kernels.
 
     Returns:

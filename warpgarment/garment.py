@@ -82,7 +82,7 @@ class Garment:
         Warns:
             UserWarning: The garment is bigger than 10 m or smaller than 5 cm, so its unit is probably another.
         """
-        from .io.mesh import read_mesh
+        from warpgarment.io.mesh import read_mesh
 
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh)
@@ -94,7 +94,7 @@ class Garment:
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes .obj, .ply, .npz or .usd (.usda, .usdc), completely or not at all. Pins are kept in .npz only."""
-        from .io.mesh import write_mesh
+        from warpgarment.io.mesh import write_mesh
 
         write_mesh(Path(path), self.vertices, self.faces, pins=self.pins, name=self.name)
 
@@ -132,7 +132,7 @@ class Garment:
     @cached_property
     def components(self) -> tuple[np.ndarray, np.ndarray, int]:
         """Connected pieces by lowest vertex: of each vertex int32 [V], of each face int32 [F], and their count."""
-        from .kernels.laplacian import components
+        from warpgarment.kernels.mesh.laplacian import components
 
         return components(len(self.vertices), self.faces)
 
@@ -190,6 +190,6 @@ class Garment:
     @cached_property
     def laplacian(self) -> csr_matrix:
         """Cotangent Laplacian of the rest mesh, positive semi-definite, float64, shape [V,V]."""
-        from .kernels.laplacian import cotangent_laplacian
+        from warpgarment.kernels.mesh.laplacian import cotangent_laplacian
 
         return cotangent_laplacian(self.vertices, self.faces)

@@ -21,11 +21,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from warpgarment import heading as _heading
-from warpgarment.attention import EncoderLayer
-from warpgarment.config import NetworkConfig
-from warpgarment.kernels.features import FEATURES
-from warpgarment.parametrisation import NetworkOutput
+from warpgarment.kernels.features.face import FEATURES
+
+from . import heading as _heading
+from .attention import EncoderLayer
+from .config import NetworkConfig
+from .parametrisation import NetworkOutput
 
 STATISTICS = {  # buffers of the normalisation and their lengths
     "feature_mean": FEATURES,
@@ -237,13 +238,13 @@ class GarmentNetwork(nn.Module):
 
     def save(self, path: str | os.PathLike[str], *, dtype: torch.dtype | None = None) -> None:
         """Writes a checkpoint; see `checkpoint.save`."""
-        from warpgarment import checkpoint
+        from . import checkpoint
 
         checkpoint.save(self, path, dtype=dtype)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: torch.device | str | None = None) -> GarmentNetwork:
         """Reads a checkpoint; see `checkpoint.load`."""
-        from warpgarment import checkpoint
+        from . import checkpoint
 
         return checkpoint.load(path, device=device)

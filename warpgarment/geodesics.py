@@ -6,7 +6,7 @@ the angles around a vertex sum to more than 2π (Mitchell, Mount and Papadimitri
 1. From every face centroid and every such vertex, unfold the strips of faces around it into the plane, keeping for
    each strip the window of directions that stay inside, and note what is seen through it: exact distances to the
    neighbourhood.
-2. Chain these segments: `kernels/shortest_paths.py`.
+2. Chain these segments: `kernels/mesh/shortest_paths.py`.
 
 `face_geodesics` does this for all pairs, `local_geodesics` for pairs within a radius, without a matrix of F x F.
 
@@ -23,8 +23,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from warpgarment.kernels.mesh.shortest_paths import Paths, neighbourhoods, unit_of
+
 from .errors import MeshError
-from .kernels.shortest_paths import Paths, neighbourhoods, unit_of
 from .mesh_checks import check_edges, checked_faces, checked_positions, complain, no_area, repeated_vertices
 
 REACH = 2.5  # windows end this many times the source's longest edge away,

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import torch
 
-from warpgarment.kernels.features import FEATURES, LAYOUT
+from warpgarment.kernels.features.face import FEATURES, LAYOUT
 
 _VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
 

@@ -10,7 +10,7 @@ import dataclasses
 
 import torch
 
-from warpgarment.kernels.features import LAYOUT
+from warpgarment.kernels.features.face import LAYOUT
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from warpgarment.errors import CheckpointError, MissingExtra
-from warpgarment.shards import INDEX
+from .errors import CheckpointError, MissingExtra
+from .shards import INDEX
 
 WANTED = ("*.safetensors", INDEX, "*.md")
 UNWANTED = ("*/*",)  # whatever lies in folders of the repository

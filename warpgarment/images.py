@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgarment.io.atomic import atomic_file
+
 from .errors import MissingExtra
-from .io.atomic import atomic_file
 
 INK, MUTED = "#2f3640", "#77808c"
 

@@ -17,14 +17,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warpgarment.batch import PackedBodies, row_groups
-from warpgarment.body import BodyMotion
-from warpgarment.config import NetworkConfig
-from warpgarment.errors import NotEnoughMemory
-from warpgarment.garment import Garment
-from warpgarment.kernels import compliance, factor
-from warpgarment.kernels.features import FEATURES
-from warpgarment.pooled_geodesics import CENTRES, NEAR
+from warpgarment.kernels.collision import compliance
+from warpgarment.kernels.features.face import FEATURES
+from warpgarment.kernels.linear import factor
+
+from .batch import PackedBodies, row_groups
+from .body import BodyMotion
+from .config import NetworkConfig
+from .errors import NotEnoughMemory
+from .garment import Garment
+from .pooled_geodesics import CENTRES, NEAR
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes: rest frames, indices; sparse matrices and vectors of the solvers

@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+
 from .geodesics import distances_from, surface_graph
-from .kernels.sdf import BodyMeshes
 from .mesh_checks import check_edges, checked_faces, to_numpy
 
 

@@ -68,7 +68,7 @@ class GarmentMotion:
             FileExistsError: The folder holds files that are not frames.
             MissingExtra: USD without ``pip install "warpgarment[usd]"``.
         """
-        from .io.sequence import write_sequence
+        from warpgarment.io.sequence import write_sequence
 
         write_sequence(
             Path(path), self.vertices, self.faces, self.fps, name=self.name or "garment", extra=self._status_arrays()
@@ -82,7 +82,7 @@ class GarmentMotion:
             MeshError: Not such a file.
             FileNotFoundError: There is no such file.
         """
-        from .io.npz import read_npz
+        from warpgarment.io.npz import read_npz
 
         path = Path(path)
         data = read_npz(path, required=("vertices", "faces", "fps"))

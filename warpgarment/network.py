@@ -13,13 +13,14 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from warpgarment.attention import geodesic_weights
-from warpgarment.config import NetworkConfig
-from warpgarment.garment_network import STATISTICS, GarmentNetwork, NormalisedOutput, rotate_output
-from warpgarment.kernels.features import FEATURES
-from warpgarment.parametrisation import NetworkOutput
-from warpgarment.patch_network import PatchTransformer
-from warpgarment.pooled_weights import PooledWeights
+from warpgarment.kernels.features.face import FEATURES
+
+from .attention import geodesic_weights
+from .config import NetworkConfig
+from .garment_network import STATISTICS, GarmentNetwork, NormalisedOutput, rotate_output
+from .parametrisation import NetworkOutput
+from .patch_network import PatchTransformer
+from .pooled_weights import PooledWeights
 
 __all__ = [
     "STATISTICS",

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import torch
 
-from warpgarment.kernels.deformation import rotation
-from warpgarment.kernels.features import FEATURES, LAYOUT
+from warpgarment.kernels.deformation.gradients import rotation
+from warpgarment.kernels.features.face import FEATURES, LAYOUT
 
 
 class NetworkOutput(NamedTuple):

@@ -20,16 +20,17 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from warpgarment import heading
-from warpgarment.attention import ACTIVATIONS
-from warpgarment.config import NetworkConfig
-from warpgarment.garment_network import GarmentNetwork, NormalisedOutput, rotate_output
-from warpgarment.kernels.features import FEATURES
-from warpgarment.parametrisation import NetworkOutput
-from warpgarment.patches import PatchLayout
+from warpgarment.kernels.features.face import FEATURES
+
+from . import heading
+from .attention import ACTIVATIONS
+from .config import NetworkConfig
+from .garment_network import GarmentNetwork, NormalisedOutput, rotate_output
+from .parametrisation import NetworkOutput
+from .patches import PatchLayout
 
 if TYPE_CHECKING:
-    from warpgarment.network import ManifoldAwareTransformer
+    from .network import ManifoldAwareTransformer
 
 
 class FaceLayer(nn.Module):

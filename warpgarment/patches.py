@@ -20,10 +20,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from warpgarment.attention import geodesic_weights
-from warpgarment.garment import Garment
-from warpgarment.geodesics import distances_from, surface_graph
-from warpgarment.kernels.laplacian import components
+from warpgarment.kernels.mesh.laplacian import components
+
+from .attention import geodesic_weights
+from .garment import Garment
+from .geodesics import distances_from, surface_graph
 
 SHARES = 4  # patches a face belongs to
 

@@ -16,8 +16,8 @@ import scipy.sparse
 import scipy.sparse.linalg
 import torch
 
-from warpgarment.kernels.laplacian import cotangent_laplacian
-from warpgarment.kernels.sdf import BodyMeshes
+from warpgarment.kernels.mesh.laplacian import cotangent_laplacian
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 
 class BodyPins:

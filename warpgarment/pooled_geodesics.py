@@ -25,8 +25,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from warpgarment.kernels.mesh.shortest_paths import Paths
+
 from .geodesics import checked_mesh, searches
-from .kernels.shortest_paths import Paths
 
 CENTRES = 4096  # at most; D_c takes 64 MiB
 NEAR = 12  # centres a face is interpolated from

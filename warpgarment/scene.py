@@ -12,26 +12,27 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from warpgarment import differentiable, memory
-from warpgarment.batch import PackedBodies, PackedGarments, padded_views
-from warpgarment.clearance import clearance
-from warpgarment.errors import MeshError
-from warpgarment.frame_graph import GraphedFrames
-from warpgarment.garment import Garment
-from warpgarment.kernels.carried import carried, face_at_each_vertex
-from warpgarment.kernels.collision import CollisionSolver
-from warpgarment.kernels.deformation import inverse_rest_frames
-from warpgarment.kernels.face_means import FaceMeans
-from warpgarment.kernels.frame_features import frame_features
-from warpgarment.kernels.next_gradients import next_gradients
-from warpgarment.kernels.poisson import PoissonSolver
-from warpgarment.kernels.sdf import BodyMeshes
-from warpgarment.kernels.surface_depth import SurfaceDepth
-from warpgarment.network import GarmentNetwork, NetworkOutput
-from warpgarment.parametrisation import Step, compose, context
-from warpgarment.pins import BodyPins, mean_response
-from warpgarment.surface import Surface, distance_to_keep
-from warpgarment.timing import Timings
+from warpgarment.kernels.collision.solver import CollisionSolver
+from warpgarment.kernels.deformation.face_means import FaceMeans
+from warpgarment.kernels.deformation.gradients import inverse_rest_frames
+from warpgarment.kernels.deformation.next_frame import next_gradients
+from warpgarment.kernels.features.carry import carried, face_at_each_vertex
+from warpgarment.kernels.features.frame_features import frame_features
+from warpgarment.kernels.poisson.solver import PoissonSolver
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.kernels.sdf.surface_depth import SurfaceDepth
+
+from . import differentiable, memory
+from .batch import PackedBodies, PackedGarments, padded_views
+from .clearance import clearance
+from .errors import MeshError
+from .frame_graph import GraphedFrames
+from .garment import Garment
+from .network import GarmentNetwork, NetworkOutput
+from .parametrisation import Step, compose, context
+from .pins import BodyPins, mean_response
+from .surface import Surface, distance_to_keep
+from .timing import Timings
 
 FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
 SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this

@@ -23,8 +23,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 
-from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_folder
+
+from .errors import CheckpointError
 
 SINGLE = "model.safetensors"  # where one file is enough; there is no index then
 INDEX = "model.safetensors.index.json"

@@ -15,20 +15,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpgarment import checkpoint
-from warpgarment.arguments import as_array, counted, known_frames, listed, per_garment
-from warpgarment.batch import PackedBodies
-from warpgarment.body import BodyMotion
-from warpgarment.errors import MeshError
-from warpgarment.frame import READ_EVERY, Frame, Recording, advance
-from warpgarment.frame_graph import GraphedFrames
-from warpgarment.garment import Garment
-from warpgarment.history import History
-from warpgarment.motion import GarmentMotion
-from warpgarment.network import GarmentNetwork
-from warpgarment.scene import Scene
-from warpgarment.state import SimulationState
-from warpgarment.timing import Timings
+from . import checkpoint
+from .arguments import as_array, counted, known_frames, listed, per_garment
+from .batch import PackedBodies
+from .body import BodyMotion
+from .errors import MeshError
+from .frame import READ_EVERY, Frame, Recording, advance
+from .frame_graph import GraphedFrames
+from .garment import Garment
+from .history import History
+from .motion import GarmentMotion
+from .network import GarmentNetwork
+from .scene import Scene
+from .state import SimulationState
+from .timing import Timings
 
 
 class Simulator:

@@ -6,8 +6,8 @@ import dataclasses
 from functools import cached_property
 from typing import Any
 
-from warpgarment.frame import Frame, Outcome, read
-from warpgarment.scene import Scene
+from .frame import Frame, Outcome, read
+from .scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from warpgarment.batch import PackedGarments
-from warpgarment.garment import Garment
-from warpgarment.kernels.body_meshes import BodyMeshes
-from warpgarment.kernels.surface_depth import SurfaceDepth, surface_depth
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.kernels.sdf.surface_depth import SurfaceDepth, surface_depth
+
+from .batch import PackedGarments
+from .garment import Garment
 
 AMPLE = 1.5  # corners are moved by this multiple of the depth between them, since a corner that is far does not follow
 

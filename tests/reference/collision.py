@@ -1,4 +1,5 @@
-"""Float64 twin of kernels/collision.py: libigl's Laplacian and distances, a sparse direct solve of 3V unknowns."""
+"""Float64 twin of kernels/collision/solver.py: libigl's Laplacian and distances, a sparse direct solve of 3V
+unknowns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Float64 NumPy twins of kernels/deformation.py and kernels/singular_values.py."""
+"""Float64 NumPy twins of kernels/deformation/gradients.py and kernels/deformation/svd.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Float64 NumPy twin of kernels/features.py."""
+"""Float64 NumPy twin of kernels/features/face.py."""
 
 from __future__ import annotations
 

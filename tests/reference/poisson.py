@@ -1,4 +1,4 @@
-"""Float64 twin of kernels/poisson.py: libigl's gradient operator and a sparse direct solve."""
+"""Float64 twin of kernels/poisson/solver.py: libigl's gradient operator and a sparse direct solve."""
 
 from __future__ import annotations
 

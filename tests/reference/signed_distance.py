@@ -1,5 +1,5 @@
-"""Float64 twins of kernels/sdf.py, by libigl: exact distances by its AABB tree, exact winding numbers summed over all
-faces."""
+"""Float64 twins of kernels/sdf/query.py, by libigl: exact distances by its AABB tree, exact winding numbers summed
+over all faces."""
 
 from __future__ import annotations
 

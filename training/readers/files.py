@@ -19,8 +19,8 @@ from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
 from warpgarment.io.mesh import read_mesh
 from warpgarment.io.sequence import SequenceData, read_sequence
+from warpgarment.training.materials import Material
 
-from ..materials import Material
 from .recording import RecordedGarment, Recording, recorded_garment
 
 Source = str | os.PathLike | tuple[str | os.PathLike, str]

@@ -13,8 +13,8 @@ from warpgarment.errors import MeshError
 from warpgarment.garment import Garment
 from warpgarment.mesh_checks import checked_fps, checked_positions
 from warpgarment.mesh_clean import clean_mesh
+from warpgarment.training.materials import Material
 
-from ..materials import Material
 from .smpl import SmplPoses
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.training.dataset import write_sequence
 
-from ..dataset import write_sequence
 from .recording import Recording
 
 SPLITS = ("train", "validation", "test")

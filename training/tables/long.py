@@ -11,16 +11,7 @@ from tqdm import tqdm
 from warpgarment import checkpoint, demo, draw
 from warpgarment.simulator import Simulator
 from warpgarment.training.dataset import Sequence
-from warpgarment.training.long_rollout import (
-    STILL,
-    Limits,
-    extended,
-    figures,
-    judged,
-    settled,
-    vertex_areas,
-    walk,
-)
+from warpgarment.training.long_rollout import STILL, Limits, extended, figures, judged, settled, vertex_areas, walk
 from warpgarment.training.rollouts import predict
 from warpgarment.training.training_set import folders_of
 

@@ -17,8 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from warpgarment.garment import Garment
-
-from ..materials import Material
+from warpgarment.training.materials import Material
 
 TEACHERS = ("newton", "blender")
 LAYER_FRICTION = 0.2  # between cloths: Newton has one coefficient for all worlds it simulates at once

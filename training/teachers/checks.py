@@ -26,8 +26,8 @@ import numpy as np
 from scipy.special import j0
 
 from warpgarment.garment import Garment
+from warpgarment.training.materials import Material
 
-from ..materials import Material
 from . import Cloth, ClothScene, Teacher
 
 GRAVITY = 9.81

@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
             raise
-        from ..errors import MissingExtra
+        from warpgarment.errors import MissingExtra
 
         return _complain(f"MissingExtra: {MissingExtra(extra, f'warpgarment {name}')}")
     except KeyboardInterrupt:

@@ -6,8 +6,9 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from .. import demo
-from ..report import STAGES, table
+from warpgarment import demo
+from warpgarment.report import STAGES, table
+
 from . import UsageError
 
 
@@ -33,7 +34,7 @@ def run(options: Bench) -> None:
     """Times the bundled dress on the bundled body."""
     import torch
 
-    from ..simulator import Simulator
+    from warpgarment.simulator import Simulator
 
     if options.frames < 1 or min(options.batch, default=0) < 1:
         raise UsageError("--frames and --batch must be at least 1.")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from ..body import BodyMotion
+from warpgarment.body import BodyMotion
+
 from . import MOTION_FORMATS, check_output
 
 

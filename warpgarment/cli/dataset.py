@@ -9,7 +9,8 @@ from typing import Literal
 
 import tyro
 
-from ..io.atomic import atomic_file
+from warpgarment.io.atomic import atomic_file
+
 from . import UsageError
 
 
@@ -75,7 +76,7 @@ def run(options: Dataset) -> None:
     elif isinstance(options.command, Import):
         _import(options.command)
     else:
-        from ..training.card import write_card
+        from warpgarment.training.card import write_card
 
         print(f"wrote {write_card(options.command.root, options.command.out, pictures=options.command.pictures)}")
 
@@ -85,7 +86,7 @@ _UNUSED = {"cloth3d": ("rest", "unit", "body_unit"), "vto": ("fps", "unit", "bod
 
 
 def _import(options: Import) -> None:
-    from ..training.readers import detect, read_recording, write_as_sequence
+    from warpgarment.training.readers import detect, read_recording, write_as_sequence
 
     kind = detect(options.source)
     names = ("body", "rest", "fps", "unit", "body_unit")
@@ -98,7 +99,7 @@ def _import(options: Import) -> None:
 
 
 def _verify(options: Verify) -> None:
-    from ..training.verify import VerificationFailed, verify
+    from warpgarment.training.verify import VerificationFailed, verify
 
     report = verify(options.root)
     print(report)

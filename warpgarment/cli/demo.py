@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from .. import demo
+from warpgarment import demo
 
 
 @dataclass

@@ -28,7 +28,7 @@ def run(options: Doctor) -> None:
     import torch
     import warp as wp
 
-    from ..kernels import _torch  # noqa: F401  (keeps Warp's banner out of the report)
+    from warpgarment.kernels import launch  # noqa: F401  (keeps Warp's banner out of the report)
 
     print(f"python {platform.python_version()} on {platform.platform()}")
     print(", ".join(f"{name} {_version(name)}" for name in _CORE))
@@ -45,10 +45,10 @@ def run(options: Doctor) -> None:
 
 def _self_check(device: str | None) -> str:
     """Rolls a tube out on a rising ball with an untrained network that moves it like skin."""
-    from ..body import BodyMotion
-    from ..garment import Garment
-    from ..network import ManifoldAwareTransformer, NetworkConfig
-    from ..simulator import Simulator
+    from warpgarment.body import BodyMotion
+    from warpgarment.garment import Garment
+    from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+    from warpgarment.simulator import Simulator
 
     began = time.perf_counter()
     ball, ball_faces = _tube(radius=0.2, height=0.4, around=24, rows=12, closed=True)

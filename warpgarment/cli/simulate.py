@@ -8,9 +8,10 @@ from pathlib import Path
 
 import tyro
 
-from ..body import BodyMotion
-from ..garment import Garment
-from ..report import rollout_table
+from warpgarment.body import BodyMotion
+from warpgarment.garment import Garment
+from warpgarment.report import rollout_table
+
 from . import MOTION_FORMATS, check_output
 
 
@@ -43,7 +44,7 @@ class Simulate:
 def run(options: Simulate) -> None:
     """Loads, fits if asked, rolls out, writes, and says how it went."""
     check_output(options.out, MOTION_FORMATS)
-    from ..simulator import Simulator
+    from warpgarment.simulator import Simulator
 
     garment = Garment.load(options.garment, unit=options.unit)
     body = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh)
@@ -51,7 +52,7 @@ def run(options: Simulate) -> None:
     simulator.timings.synchronise = True
     first = None
     if options.fit_rest is not None:
-        from ..fitting import fit
+        from warpgarment.fitting import fit
 
         whole = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh, collider=False)
         rest = BodyMotion.load(options.fit_rest, unit=options.body_unit, collider=False)

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import tyro
 
-from .. import draw
-from ..body import BodyMotion
-from ..errors import MissingExtra
-from ..motion import GarmentMotion
+from warpgarment import draw
+from warpgarment.body import BodyMotion
+from warpgarment.errors import MissingExtra
+from warpgarment.motion import GarmentMotion
+
 from . import UsageError, check_output
 
 

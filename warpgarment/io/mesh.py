@@ -8,7 +8,8 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from ..errors import MeshError
+from warpgarment.errors import MeshError
+
 from .atomic import atomic_file
 from .npz import read_npz, write_npz
 from .obj import read_obj, write_obj

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import MeshError
+from warpgarment.errors import MeshError
+
 from .atomic import atomic_file
 
 

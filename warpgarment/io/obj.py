@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MeshError
+from warpgarment.errors import MeshError
+
 from .atomic import atomic_file
 from .polygons import triangulate
 

@@ -8,7 +8,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..errors import MeshError
+from warpgarment.errors import MeshError
+
 from .polygons import triangulate_counts
 
 TYPES = {

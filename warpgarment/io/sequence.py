@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import MeshError
-from ..skinning import linear_blend_skinning
+from warpgarment.errors import MeshError
+from warpgarment.skinning import linear_blend_skinning
+
 from .atomic import atomic_files, atomic_folder
 from .mesh import READABLE, read_mesh, scale_of
 from .npz import read_npz, write_npz

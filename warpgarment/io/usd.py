@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import MeshError, MissingExtra
-from ..mesh_checks import checked_faces, checked_fps, checked_positions
+from warpgarment.errors import MeshError, MissingExtra
+from warpgarment.mesh_checks import checked_faces, checked_fps, checked_positions
+
 from .atomic import atomic_file
 from .polygons import triangulate_counts
 

@@ -1,0 +1,175 @@
+"""The contacts of a garment with a body: closest points and outward directions in float64. Symbols: solver.py.
+
+The nearest way out of a limb is the wrong one for a vertex that is past its middle: it leads through the limb. Where it
+is known from where a vertex comes, the way from there to the vertex is followed to the first face, and if the nearest
+surface looks the other way than that face, the contact is with that face.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.linear.conjugate_gradients import view
+from warpgarment.kernels.operator import allocate
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.kernels.sdf.closest import Bodies
+
+AT_SURFACE = wp.constant(wp.float64(1e-7))
+"""Below this distance [m] the direction from the closest point is noise, and the face's normal is taken."""
+
+
+@wp.func
+def closest_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
+    """The point of a triangle closest to p: the foot of the perpendicular if inside, or else on the nearest edge."""
+    n = wp.cross(b - a, c - a)
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    outside = wp.int32(0)
+    best = a
+    for k in range(3):
+        start = wp.where(k == 0, a, wp.where(k == 1, b, c))
+        edge = wp.where(k == 0, b, wp.where(k == 1, c, a)) - start
+        if wp.dot(wp.cross(n, edge), p - start) < zero:
+            outside += 1
+        t = wp.clamp(wp.dot(p - start, edge) / wp.max(wp.dot(edge, edge), wp.float64(1e-300)), zero, one)
+        q = start + t * edge
+        if wp.length_sq(p - q) < wp.length_sq(p - best):
+            best = q
+    if outside == 0 and wp.length_sq(n) > zero:
+        best = p - n * (wp.dot(n, p - a) / wp.length_sq(n))
+    return best
+
+
+@wp.func
+def entered(bodies: Bodies, b: int, origin: wp.vec3, end: wp.vec3) -> int:
+    """The face through which a way goes into a body, packed; -1 if it meets none first or comes out of one."""
+    way = end - origin
+    length = wp.length(way)
+    if b < 0 or b >= bodies.meshes.shape[0] or not (length > 0.0 and wp.isfinite(length)):
+        return -1
+    hit = wp.mesh_query_ray(bodies.meshes[b], origin, way / length, length)
+    if not hit.result or wp.dot(hit.normal, way) >= 0.0:
+        return -1
+    return hit.face + bodies.face_offsets[b]
+
+
+@wp.kernel(enable_backward=False)
+def find_contacts(
+    # Body:
+    bodies: Bodies,
+    # In:
+    vertices: wp.array[wp.vec3],
+    distance: wp.array[wp.float32],
+    face: wp.array[wp.int32],
+    body_of_vertex: wp.array[wp.int32],
+    origin: wp.array[wp.vec3],  # or nothing
+    epsilon: wp.float64,
+    # Out:
+    closest: wp.array[wp.vec3d],
+    normal: wp.array[wp.vec3d],
+):
+    """Closest points and outward directions at the vertices closer than epsilon, zero elsewhere.
+
+    The closest point is computed again in float64: of a direction over 0.1 mm, float32 leaves three digits.
+    """
+    i = wp.tid()
+    n = wp.vec3d()
+    u = wp.vec3d()
+    if wp.float64(distance[i]) < epsilon:
+        p = wp.vec3d(vertices[i])
+        corner = bodies.faces[face[i]]
+        a = wp.vec3d(bodies.vertices[corner[0]])
+        b = wp.vec3d(bodies.vertices[corner[1]])
+        c = wp.vec3d(bodies.vertices[corner[2]])
+        u = closest_on_triangle(p, a, b, c)
+        length = wp.length(p - u)
+        if length > AT_SURFACE:
+            n = (p - u) / length
+            if distance[i] < 0.0:
+                n = -n
+        else:
+            n = wp.normalize(wp.cross(b - a, c - a))
+        if distance[i] < 0.0 and origin.shape[0] > 0:
+            entry = entered(bodies, body_of_vertex[i], origin[i], vertices[i])
+            if entry >= 0:
+                corner = bodies.faces[entry]
+                a = wp.vec3d(bodies.vertices[corner[0]])
+                outward = wp.normalize(
+                    wp.cross(wp.vec3d(bodies.vertices[corner[1]]) - a, wp.vec3d(bodies.vertices[corner[2]]) - a)
+                )
+                if wp.dot(outward, n) < wp.float64(0.0):
+                    u = p - wp.dot(outward, p - a) * outward  # any point of its plane does
+                    n = outward
+    closest[i] = u
+    normal[i] = n
+
+
+@wp.kernel(enable_backward=False)
+def contact_gap(
+    # In:
+    vertices: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3d],
+    closest: wp.array[wp.vec3d],
+    epsilon: wp.float64,
+    # Out:
+    gap: wp.array[wp.float64],
+):
+    """c = ε - n·(Ṽ - U) at the contacts, zero elsewhere."""
+    i = wp.tid()
+    n = normal[i]
+    c = wp.float64(0.0)
+    if wp.dot(n, n) > c:
+        c = epsilon - wp.dot(n, wp.vec3d(vertices[i]) - closest[i])
+    gap[i] = c
+
+
+def contacts(
+    vertices: torch.Tensor,
+    distance: torch.Tensor,
+    face: torch.Tensor,
+    bodies: BodyMeshes,
+    epsilon: float,
+    *,
+    body_of_vertex: torch.Tensor | None = None,
+    origin: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The set C: what a body query found closer than epsilon.
+
+    Args:
+        vertices: Positions [m], float32 [V,3].
+        distance: Signed distance [m], float32 [V], negative inside.
+        face: Nearest body face, int32 [V].
+        bodies: The bodies in the frame of `vertices`.
+        epsilon: Distance kept from the body [m].
+        body_of_vertex: Body of each vertex, int32 [V]; None where there is one body.
+        origin: Where each vertex comes from [m], float32 [V,3], outside the body or NaN: vertices inside are led back
+            to the side where they went in. None: they leave by the nearest way.
+
+    Returns:
+        Closest points of the surface or, for vertices that are led back, of the plane of the face where they went in,
+        [m], and outward directions, float64 [V,3]; zero at vertices that are not in C.
+    """
+    vertices = vertices.detach().contiguous()
+    body_of_vertex = bodies.body_of("body_of_vertex", body_of_vertex, len(vertices))
+    origin = vertices.new_empty((0, 3)) if origin is None else origin.detach().contiguous()
+    closest, normal = allocate((2, len(vertices), 3), torch.float64, vertices.device)
+    with torch_stream(vertices.device) as device:
+        wp.launch(
+            find_contacts,
+            dim=len(vertices),
+            inputs=[
+                bodies.model,
+                view(vertices, wp.vec3),
+                view(distance, wp.float32),
+                view(face, wp.int32),
+                view(body_of_vertex, wp.int32),
+                view(origin, wp.vec3),
+                float(epsilon),
+                view(closest, wp.vec3d),
+                view(normal, wp.vec3d),
+            ],
+            device=device,
+        )
+    return closest, normal

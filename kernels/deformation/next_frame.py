@@ -1,0 +1,133 @@
+"""The deformation gradients a garment should have next: steps 2 and 3 of Algorithm 1, in two launches.
+
+Manifold-aware transformers, Algorithm 1: "Φ ← Ψ Φ, replace singular values of Φ with Σ" (svd.py).
+
+    | paper | code            | what                                                        |
+    | ----- | --------------- | ----------------------------------------------------------- |
+    | Ψ     | psi             | predicted relative deformation gradient                     |
+    | Φ     | features, first | of the newest frame, row-major in the first nine columns    |
+    | Σ     | singular_values | predicted                                                   |
+    | q     | velocity        | predicted change of the mean of each component [m]          |
+
+A garment of which any number is NaN or infinite keeps its Φ (with all singular values 1 if they are replaced), so that
+it cannot spoil the others of its batch in a solver.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import as_argument, expect, torch_stream
+from warpgarment.kernels.operator import allocate
+
+from .svd import svd
+
+
+@wp.kernel(enable_backward=False)
+def broken_garments_kernel(
+    # Model:
+    garment_of_face: wp.array[wp.int32],
+    component_of_face: wp.array[wp.int32],
+    # In:
+    psi: wp.array[wp.mat33],
+    singular_values: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+    # Out:
+    broken: wp.array[wp.int32],  # marked, not cleared
+):
+    i = wp.tid()
+    q = velocity[component_of_face[i]]
+    if not (wp.isfinite(psi[i]) and wp.isfinite(singular_values[i]) and wp.isfinite(q)):
+        broken[garment_of_face[i]] = 1
+
+
+@wp.kernel(enable_backward=False)
+def next_gradients_kernel(
+    # Model:
+    garment_of_face: wp.array[wp.int32],
+    replace: wp.bool,
+    smallest: wp.float32,
+    # In:
+    features: wp.array2d[wp.float32],
+    psi: wp.array[wp.mat33],
+    singular_values: wp.array[wp.vec3],
+    broken: wp.array[wp.int32],
+    # Out:
+    target: wp.array[wp.mat33],
+):
+    i = wp.tid()
+    phi = wp.mat33d()
+    for row in range(3):
+        for column in range(3):
+            phi[row, column] = wp.float64(features[i, 3 * row + column])
+    s = wp.vec3(1.0)
+    if broken[garment_of_face[i]] == 0:
+        phi = wp.mat33d(psi[i]) * phi
+        for k in range(3):
+            s[k] = wp.max(singular_values[i][k], smallest)
+    if replace:
+        u, _sigma, v = svd(phi)
+        phi = u * wp.diag(wp.vec3d(s)) * wp.transpose(v)
+    target[i] = wp.mat33(phi)
+
+
+def next_gradients(
+    features: torch.Tensor,
+    psi: torch.Tensor,
+    singular_values: torch.Tensor,
+    velocity: torch.Tensor,
+    component_of_face: torch.Tensor,
+    garment_of_face: torch.Tensor,
+    garments: int,
+    *,
+    replace: bool = True,
+    smallest: float = 1e-3,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Ψ Φ with other singular values, and whose prediction is finite; without gradients.
+
+    Args:
+        features: Of the newest frame (`features.LAYOUT`), float32 [F, 34].
+        psi: float32 [F, 3, 3].
+        singular_values: Descending, float32 [F, 3].
+        velocity: float32 [C, 3].
+        component_of_face: int32 [F], within [0, C).
+        garment_of_face: int32 [F], within [0, garments).
+        garments: B.
+        replace: Whether the singular values of ΨΦ are replaced.
+        smallest: What replaces them is at least this; a face squeezed further would fold onto itself.
+
+    Returns:
+        Deformation gradients, float32 [F, 3, 3], and whether all numbers of a garment are finite, bool [B].
+    """
+    rows, device = len(psi), psi.device
+    expect("psi", psi, (None, 3, 3))
+    expect("features", features, (rows, None), device=device)
+    expect("singular_values", singular_values, (rows, 3), device=device)
+    expect("velocity", velocity, (None, 3), device=device)
+    expect("component_of_face", component_of_face, (rows,), torch.int32, device)
+    expect("garment_of_face", garment_of_face, (rows,), torch.int32, device)
+    if features.shape[1] < 9:
+        raise ValueError(f"features must hold the 9 numbers of a deformation gradient, got {features.shape[1]}")
+    broken = torch.zeros(garments, dtype=torch.int32, device=device)
+    target = allocate((rows, 3, 3), torch.float32, device)
+    if rows:
+        with torch_stream(device) as warp_device:
+            gradients, values = as_argument(psi, wp.mat33), as_argument(singular_values, wp.vec3)
+            owner, marked = as_argument(garment_of_face, wp.int32), as_argument(broken, wp.int32)
+            components = as_argument(component_of_face, wp.int32)
+            wp.launch(
+                broken_garments_kernel,
+                dim=rows,
+                inputs=[owner, components, gradients, values, as_argument(velocity, wp.vec3)],
+                outputs=[marked],
+                device=warp_device,
+            )
+            wp.launch(
+                next_gradients_kernel,
+                dim=rows,
+                inputs=[owner, replace, smallest, as_argument(features, wp.float32), gradients, values, marked],
+                outputs=[as_argument(target, wp.mat33)],
+                device=warp_device,
+            )
+    return target, broken == 0

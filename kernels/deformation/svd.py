@@ -1,0 +1,303 @@
+"""Singular values of deformation gradients: reading them, replacing them, removing them.
+
+Manifold-aware transformers, section 4.3.1 and Algorithm 1 ("replace singular values of Φ with Σ"). The network
+predicts the singular values of a face's deformation gradient apart from the gradient itself, because they say how
+much cloth stretches; here they are put back:
+
+    Φ = U diag(σ) Vᵀ,    R(Φ, s) = U diag(|s|) Vᵀ,    U and V proper rotations, σ₁ >= σ₂ >= |σ₃|
+
+    | paper | code            | what                                                                   |
+    | ----- | --------------- | ---------------------------------------------------------------------- |
+    | Φ     | phi             | deformation gradient of a face, 3x3                                    |
+    | Σ     | singular_values | its singular values, descending, never negative                        |
+    | σ     | sigma           | the same with the sign of det Φ on the smallest, as proper U, V demand |
+
+Gradients. With P = Uᵀ dΦ V and T = Uᵀ dR V, the rotations of U and V follow from the off-diagonal of P, and for i < j
+
+    T_ij + T_ji = (s_i − s_j)/(σ_i − σ_j) (P_ij + P_ji)
+    T_ij − T_ji = (s_i + s_j)/(σ_i + σ_j) (P_ij − P_ji)
+    T_ii = ds_i
+
+R jumps where σ_i = σ_j but s_i != s_j, so the first quotient has no limit there (an undeformed face is such a place).
+Both are held below `MAX_GAIN`: gradients are exact wherever R amplifies less than that, and bounded everywhere.
+
+The decomposition runs in float64 (Warp's float32 one is off by 2e-4 on garments), by one-sided Jacobi rotations
+(Hestenes 1958): columns of A = Φ V are turned against each other until they are orthogonal; then σ are their lengths
+and U their directions. Stretched cloth is nearly orthogonal to begin with, so two or three sweeps do, where Warp's
+`svd3` always makes the same many.
+
+For Φ = [e1, e2, n] Q_rest⁻¹ (gradients.py) no decomposition is needed. With r_k the rows of Q_rest⁻¹, r_2 is
+orthogonal to the others and n to the edges: |n| |r_2| = 1 is one value (0 for a face without area), and the other two
+are those of a map between planes, with columns m, k in an orthonormal basis along r_0:
+
+    (σ₁ ± σ₂)² = |m|² + |k|² ± 2 |m × k|,    (σ₁ − σ₂)² = (|m| − |k|)² + 2 (m·k)² / (|m||k| + |m × k|)
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import expect
+from warpgarment.kernels.operator import row_operator
+
+MAX_GAIN = wp.constant(wp.float64(100.0))
+"""Largest factor by which the gradient of replace_singular_values may amplify one mode of its argument."""
+
+
+# Cosine between two columns, squared, below which they count as orthogonal
+ORTHOGONAL = wp.constant(wp.float64(1.0e-26))
+SWEEPS = wp.constant(16)  # never reached
+# Second singular value over the first below which its direction is rounding
+FLAT = wp.constant(wp.float64(1.0e-14))
+
+
+@wp.func
+def turn(x: wp.vec3d, y: wp.vec3d):
+    """Cosine and sine of the rotation that makes two columns orthogonal; 1 and 0 where they are."""
+    one = wp.float64(1.0)
+    xx = wp.dot(x, x)
+    yy = wp.dot(y, y)
+    xy = wp.dot(x, y)
+    if not xy * xy > ORTHOGONAL * xx * yy:
+        return one, wp.float64(0.0)
+    zeta = (yy - xx) / (wp.float64(2.0) * xy)
+    t = one / (wp.abs(zeta) + wp.sqrt(one + zeta * zeta))
+    t = wp.where(zeta < wp.float64(0.0), -t, t)
+    c = one / wp.sqrt(one + t * t)
+    return c, c * t
+
+
+@wp.func
+def svd(m: wp.mat33d):
+    """U, σ, V with U and V proper rotations, σ descending by magnitude, the sign of the determinant on the last."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    a = wp.vec3d(m[0, 0], m[1, 0], m[2, 0])
+    b = wp.vec3d(m[0, 1], m[1, 1], m[2, 1])
+    c = wp.vec3d(m[0, 2], m[1, 2], m[2, 2])
+    va = wp.vec3d(one, zero, zero)
+    vb = wp.vec3d(zero, one, zero)
+    vc = wp.vec3d(zero, zero, one)
+    sweep = wp.int32(0)
+    while sweep < SWEEPS:
+        sweep += 1
+        cos_ab, sin_ab = turn(a, b)
+        a, b = cos_ab * a - sin_ab * b, sin_ab * a + cos_ab * b
+        va, vb = cos_ab * va - sin_ab * vb, sin_ab * va + cos_ab * vb
+        cos_ac, sin_ac = turn(a, c)
+        a, c = cos_ac * a - sin_ac * c, sin_ac * a + cos_ac * c
+        va, vc = cos_ac * va - sin_ac * vc, sin_ac * va + cos_ac * vc
+        cos_bc, sin_bc = turn(b, c)
+        b, c = cos_bc * b - sin_bc * c, sin_bc * b + cos_bc * c
+        vb, vc = cos_bc * vb - sin_bc * vc, sin_bc * vb + cos_bc * vc
+        if sin_ab == zero and sin_ac == zero and sin_bc == zero:
+            sweep = SWEEPS
+    if wp.dot(b, b) > wp.dot(a, a):
+        a, b = b, a
+        va, vb = vb, va
+    if wp.dot(c, c) > wp.dot(b, b):
+        b, c = c, b
+        vb, vc = vc, vb
+    if wp.dot(b, b) > wp.dot(a, a):
+        a, b = b, a
+        va, vb = vb, va
+    first = wp.length(a)
+    second = wp.length(b)
+    ua = wp.vec3d(one, zero, zero)
+    if first != zero:
+        ua = a / first
+    if not second <= FLAT * first:
+        ub = b / second
+    else:  # any direction across
+        size = wp.vec3d(wp.abs(ua[0]), wp.abs(ua[1]), wp.abs(ua[2]))
+        across = wp.where(
+            size[0] < wp.min(size[1], size[2]),
+            wp.vec3d(one, zero, zero),
+            wp.where(size[1] < size[2], wp.vec3d(zero, one, zero), wp.vec3d(zero, zero, one)),
+        )
+        ub = wp.normalize(wp.cross(ua, across))
+    uc = wp.cross(ua, ub)
+    last = wp.cross(va, vb)  # vc or its opposite
+    third = wp.dot(uc, c) * wp.dot(last, vc)
+    return wp.matrix_from_cols(ua, ub, uc), wp.vec3d(first, second, third), wp.matrix_from_cols(va, vb, last)
+
+
+@wp.func
+def singular_values_of(phi: wp.mat33):
+    """Singular values, descending and not negative."""
+    _u, sigma, _v = svd(wp.mat33d(phi))
+    return wp.vec3(wp.vec3d(sigma[0], sigma[1], wp.abs(sigma[2])))
+
+
+@wp.func_grad(singular_values_of)
+def adj_singular_values_of(phi: wp.mat33, adj_ret: wp.vec3):
+    """dσ_i = u_iᵀ dΦ v_i: no quotient, so repeated values do no harm."""
+    u, sigma, v = svd(wp.mat33d(phi))
+    g = wp.vec3d(adj_ret)
+    if sigma[2] < wp.float64(0.0):
+        g = wp.vec3d(g[0], g[1], -g[2])
+    wp.adjoint[phi] += wp.mat33(u * wp.diag(g) * wp.transpose(v))
+
+
+@wp.func
+def frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33):
+    """Singular values, descending, of Φ = Q Q_rest⁻¹ with Q = [e1, e2, n]: see above."""
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    f = wp.mat33d(q)
+    g = wp.mat33d(inverse_rest)
+    r0 = g[0]
+    r1 = g[1]
+    along = wp.length(r0)
+    t = wp.normalize(r0)
+    shear = wp.dot(r1, t)
+    m = wp.vec3d(f[0, 0], f[1, 0], f[2, 0]) * along + wp.vec3d(f[0, 1], f[1, 1], f[2, 1]) * shear
+    k = wp.vec3d(f[0, 1], f[1, 1], f[2, 1]) * wp.length(r1 - shear * t)
+    lm = wp.length(m)
+    lk = wp.length(k)
+    area = wp.length(wp.cross(m, k))
+    apart = (lm - lk) * (lm - lk)
+    below = lm * lk + area
+    if below > zero:
+        apart += wp.float64(2.0) * wp.dot(m, k) * wp.dot(m, k) / below
+    together = wp.sqrt(lm * lm + lk * lk + wp.float64(2.0) * area)
+    high = half * (together + wp.sqrt(apart))
+    low = zero
+    if high > zero:
+        low = area / high
+    normal = wp.length(wp.vec3d(f[0, 2], f[1, 2], f[2, 2])) * wp.length(g[2])
+    return wp.vec3(wp.vec3d(wp.max(high, normal), wp.max(low, wp.min(high, normal)), wp.min(low, normal)))
+
+
+@wp.func_grad(frame_singular_values)
+def adj_frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33, adj_ret: wp.vec3):
+    """That of the singular values of the product."""
+    u, sigma, v = svd(wp.mat33d(q * inverse_rest))
+    g = wp.vec3d(adj_ret)
+    if sigma[2] < wp.float64(0.0):
+        g = wp.vec3d(g[0], g[1], -g[2])
+    adj_phi = wp.mat33(u * wp.diag(g) * wp.transpose(v))
+    wp.adjoint[q] += adj_phi * wp.transpose(inverse_rest)
+    wp.adjoint[inverse_rest] += wp.transpose(q) * adj_phi
+
+
+@wp.func
+def with_singular_values(phi: wp.mat33, values: wp.vec3):
+    """U diag(|values|) Vᵀ with proper rotations U and V of phi."""
+    u, _sigma, v = svd(wp.mat33d(phi))
+    s = wp.vec3d(values)
+    return wp.mat33(u * wp.diag(wp.vec3d(wp.abs(s[0]), wp.abs(s[1]), wp.abs(s[2]))) * wp.transpose(v))
+
+
+@wp.func
+def bounded_quotient(numerator: wp.float64, denominator: wp.float64):
+    """numerator / denominator for denominator >= 0, cut off at ±MAX_GAIN; 0 / 0 is 0."""
+    if numerator == wp.float64(0.0):
+        return wp.float64(0.0)
+    if wp.abs(numerator) >= MAX_GAIN * denominator:
+        return MAX_GAIN * wp.sign(numerator)
+    return numerator / denominator
+
+
+@wp.func_grad(with_singular_values)
+def adj_with_singular_values(phi: wp.mat33, values: wp.vec3, adj_ret: wp.mat33):
+    """The map from P to T above is its own transpose, so it serves the adjoint as it stands."""
+    u, sigma, v = svd(wp.mat33d(phi))
+    g = wp.transpose(u) * wp.mat33d(adj_ret) * v
+    s = wp.vec3d(values)
+    m = wp.mat33d()
+    for i in range(3):
+        for j in range(i + 1, 3):
+            together = bounded_quotient(wp.abs(s[i]) - wp.abs(s[j]), sigma[i] - sigma[j]) * (g[i, j] + g[j, i])
+            against = bounded_quotient(wp.abs(s[i]) + wp.abs(s[j]), sigma[i] + sigma[j]) * (g[i, j] - g[j, i])
+            m[i, j] = wp.float64(0.5) * (together + against)
+            m[j, i] = wp.float64(0.5) * (together - against)
+    wp.adjoint[phi] += wp.mat33(u * m * wp.transpose(v))
+    wp.adjoint[values] += wp.vec3(wp.vec3d(wp.sign(s[0]) * g[0, 0], wp.sign(s[1]) * g[1, 1], wp.sign(s[2]) * g[2, 2]))
+
+
+@wp.kernel
+def singular_values_kernel(
+    # In:
+    phi: wp.array[wp.mat33],
+    # Out:
+    values: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    values[i] = singular_values_of(phi[i])
+
+
+@wp.kernel
+def replace_singular_values_kernel(
+    # In:
+    phi: wp.array[wp.mat33],
+    values: wp.array[wp.vec3],
+    # Out:
+    replaced: wp.array[wp.mat33],
+):
+    i = wp.tid()
+    replaced[i] = with_singular_values(phi[i], values[i])
+
+
+_singular_values = row_operator(
+    "singular_values",
+    singular_values_kernel,
+    {"phi": wp.mat33},
+    {"values": (wp.vec3, (3,))},
+    rows="phi",
+    gradients=["phi"],
+)
+_replace_singular_values = row_operator(
+    "replace_singular_values",
+    replace_singular_values_kernel,
+    {"phi": wp.mat33, "values": wp.vec3},
+    {"replaced": (wp.mat33, (3, 3))},
+    rows="phi",
+    gradients=["phi", "values"],
+)
+
+
+def singular_values(phi: torch.Tensor) -> torch.Tensor:
+    """Singular values of 3x3 matrices.
+
+    Args:
+        phi: Deformation gradients, float32 [F, 3, 3].
+
+    Returns:
+        Singular values, float32 [F, 3], descending, never negative. Differentiable in phi, with u_i v_iᵀ.
+    """
+    expect("phi", phi, (None, 3, 3))
+    return _singular_values(phi)
+
+
+def replace_singular_values(phi: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
+    """The matrices with other singular values: U diag(|s|) Vᵀ of phi = U diag(σ) Vᵀ.
+
+    U and V are proper rotations, so the result has a positive determinant even where phi is inverted. A negative
+    value means its magnitude, as a singular value has no sign.
+
+    Args:
+        phi: Deformation gradients, float32 [F, 3, 3].
+        s: New singular values, float32 [F, 3]; s[:, 0] takes the place of the largest, and so on.
+
+    Returns:
+        float32 [F, 3, 3]. Differentiable in both; where singular values of phi meet, the gradient is bounded (see
+        `MAX_GAIN`).
+    """
+    expect("phi", phi, (None, 3, 3))
+    expect("s", s, (phi.shape[0], 3), device=phi.device)
+    return _replace_singular_values(phi, s)
+
+
+def rotation(phi: torch.Tensor) -> torch.Tensor:
+    """The proper rotations nearest to 3x3 matrices: U Vᵀ, the polar factor.
+
+    Args:
+        phi: float32 [F, 3, 3].
+
+    Returns:
+        float32 [F, 3, 3], determinant +1. Differentiable.
+    """
+    expect("phi", phi, (None, 3, 3))
+    return _replace_singular_values(phi, phi.new_ones(phi.shape[:2]))

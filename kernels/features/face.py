@@ -1,0 +1,312 @@
+"""What the network sees of a face: 34 numbers per face and frame.
+
+In two launches, of which the first may be kept and the second has gradients; frame_features.py does both in one.
+
+Manifold-aware transformers, section 4.2 and, for their order, f_i in section 4.3.
+
+    f_i = (Φ_i, n_i, c_i − z, d_i, v̄_i, D_i, q̄_i, Σ_i)
+
+    | paper | code                 | what                                                              |
+    | ----- | -------------------- | ----------------------------------------------------------------- |
+    | Φ     | deformation_gradient | against the rest pose, row-major                                  |
+    | n     | normal               | unit normal                                                       |
+    | c − z | centroid             | of the face, less z, the garment's mean of these [m]              |
+    | d     | signed_distance      | of the centroid to the body [m]                                   |
+    | v̄     | direction_to_body    | unit vector from the centroid to the nearest body point           |
+    | D     | body_deformation     | of the nearest body face from t to t+1, Q_next Q⁻¹ (there: d_i)   |
+    | q̄     | body_velocity        | displacement of that face's centroid from t to t+1 [m per frame]  |
+    | Σ     | singular_values      | of Φ, descending                                                  |
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.deformation.gradients import corners_exist, expect_mesh, face_frame
+from warpgarment.kernels.deformation.svd import frame_singular_values
+from warpgarment.kernels.launch import as_argument, expect, torch_stream
+from warpgarment.kernels.operator import allocate, row_operator
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.kernels.sdf.closest import MAX_DISTANCE, Bodies, closest_on_body
+
+LAYOUT: dict[str, slice] = {
+    "deformation_gradient": slice(0, 9),
+    "normal": slice(9, 12),
+    "centroid": slice(12, 15),
+    "signed_distance": slice(15, 16),
+    "direction_to_body": slice(16, 19),
+    "body_deformation": slice(19, 28),
+    "body_velocity": slice(28, 31),
+    "singular_values": slice(31, 34),
+}
+"""Where each feature lies among the `FEATURES` numbers of a face."""
+
+FEATURES = 34
+
+TOUCHING = wp.constant(1.0e-9)  # metres; closer than this, a point has no direction to the body
+# Height over longest edge; the motion of thinner body faces is mostly rounding
+SLIVER = wp.constant(wp.float64(1.0e-4))
+
+
+class BodyInteraction(NamedTuple):
+    """What each garment face needs to know of its body; holds for as long as garment and body move little.
+
+    Where no body point was found (see `BodyQuery`), closest is NaN, sign +1, face -1, deformation the identity,
+    velocity zero.
+    """
+
+    closest: torch.Tensor
+    """Nearest surface point [m], float32 [F, 3]."""
+    sign: torch.Tensor
+    """+1 outside, -1 inside, float32 [F]."""
+    face: torch.Tensor
+    """Packed index of the nearest body face, int32 [F]."""
+    deformation: torch.Tensor
+    """Deformation gradient of that face from t to t+1, float32 [F, 3, 3]; the identity where the face has no area."""
+    velocity: torch.Tensor
+    """Displacement of that face's centroid from t to t+1 [m per frame], float32 [F, 3]."""
+
+
+@wp.func
+def frame_or_zero(a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Q = [e1, e2, n] in float64; zero where the triangle is a sliver or not finite."""
+    e1 = wp.vec3d(b) - wp.vec3d(a)
+    e2 = wp.vec3d(c) - wp.vec3d(a)
+    area = wp.cross(e1, e2)
+    if not wp.length(area) > SLIVER * wp.max(wp.dot(e1, e1), wp.dot(e2, e2)):
+        return wp.mat33d()
+    return wp.matrix_from_cols(e1, e2, wp.normalize(area))
+
+
+@wp.func
+def nearest_motion(bodies: Bodies, b: int, point: wp.vec3, next_vertices: wp.array[wp.vec3]):
+    """The fields of `BodyInteraction` of one point."""
+    closest = wp.vec3(wp.nan)
+    sign = wp.float32(1.0)
+    face = wp.int32(-1)
+    deformation = wp.identity(n=3, dtype=wp.float32)
+    velocity = wp.vec3(0.0)
+    if b >= 0 and b < bodies.meshes.shape[0]:
+        found, side, _weights, position = closest_on_body(bodies, b, point, MAX_DISTANCE)
+        if found >= 0:
+            closest = wp.vec3(position)
+            sign = side
+            face = found + bodies.face_offsets[b]
+            corner = bodies.faces[face]
+            a0, a1, a2 = bodies.vertices[corner[0]], bodies.vertices[corner[1]], bodies.vertices[corner[2]]
+            b0, b1, b2 = next_vertices[corner[0]], next_vertices[corner[1]], next_vertices[corner[2]]
+            velocity = ((b0 - a0) + (b1 - a1) + (b2 - a2)) / 3.0
+            q = frame_or_zero(a0, a1, a2)
+            q_next = frame_or_zero(b0, b1, b2)
+            if wp.determinant(q) > wp.float64(0.0) and wp.determinant(q_next) > wp.float64(0.0):
+                deformation = wp.mat33(q_next * wp.inverse(q))
+    return closest, sign, face, deformation, velocity
+
+
+@wp.kernel(enable_backward=False)
+def body_interaction_kernel(
+    # Model:
+    bodies: Bodies,
+    # In:
+    centroids: wp.array[wp.vec3],
+    body_of_face: wp.array[wp.int32],
+    next_vertices: wp.array[wp.vec3],
+    # Out:
+    closest: wp.array[wp.vec3],
+    sign: wp.array[wp.float32],
+    face: wp.array[wp.int32],
+    deformation: wp.array[wp.mat33],
+    velocity: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    c, s, f, d, v = nearest_motion(bodies, body_of_face[i], centroids[i], next_vertices)
+    closest[i] = c
+    sign[i] = s
+    face[i] = f
+    deformation[i] = d
+    velocity[i] = v
+
+
+@wp.func
+def write_features(
+    features: wp.array2d[wp.float32],
+    i: int,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    inverse_rest: wp.mat33,
+    mean: wp.vec3,
+    closest: wp.vec3,
+    sign: float,
+    body_deformation: wp.mat33,
+    body_velocity: wp.vec3,
+):
+    """Row i of the features, for the face with corners a, b, c."""
+    q = face_frame(a, b, c)
+    phi = q * inverse_rest
+    s = frame_singular_values(q, inverse_rest)
+    z = (a + b + c) / 3.0
+
+    to_body = closest - z
+    distance = wp.length(to_body)
+    direction = wp.vec3(0.0)
+    if not distance < TOUCHING:
+        direction = to_body / distance
+
+    for row in range(3):
+        for column in range(3):
+            features[i, 3 * row + column] = phi[row, column]
+            features[i, 19 + 3 * row + column] = body_deformation[row, column]
+        features[i, 9 + row] = q[row, 2]
+        features[i, 12 + row] = z[row] - mean[row]
+        features[i, 16 + row] = direction[row]
+        features[i, 28 + row] = body_velocity[row]
+        features[i, 31 + row] = s[row]
+    features[i, 15] = sign * distance
+
+
+@wp.kernel
+def face_features_kernel(
+    # In:
+    inverse_rest: wp.array[wp.mat33],
+    vertices: wp.array[wp.vec3],
+    faces: wp.array[wp.vec3i],
+    garment_of_face: wp.array[wp.int32],
+    garment_mean: wp.array[wp.vec3],
+    closest: wp.array[wp.vec3],
+    sign: wp.array[wp.float32],
+    body_deformation: wp.array[wp.mat33],
+    body_velocity: wp.array[wp.vec3],
+    # Out:
+    features: wp.array2d[wp.float32],
+):
+    i = wp.tid()
+    face = faces[i]
+    garment = garment_of_face[i]
+    if not corners_exist(face, vertices.shape[0]) or garment < 0 or garment >= garment_mean.shape[0]:
+        for k in range(wp.static(FEATURES)):
+            features[i, k] = wp.nan
+        return
+    a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
+    mean = garment_mean[garment]
+    write_features(
+        features, i, a, b, c, inverse_rest[i], mean, closest[i], sign[i], body_deformation[i], body_velocity[i]
+    )
+
+
+_face_features = row_operator(
+    "face_features",
+    face_features_kernel,
+    {
+        "inverse_rest": wp.mat33,
+        "vertices": wp.vec3,
+        "faces": wp.vec3i,
+        "garment_of_face": wp.int32,
+        "garment_mean": wp.vec3,
+        "closest": wp.vec3,
+        "sign": wp.float32,
+        "body_deformation": wp.mat33,
+        "body_velocity": wp.vec3,
+    },
+    {"features": (wp.float32, (FEATURES,))},
+    rows="faces",
+    gradients=["vertices", "garment_mean"],
+)
+
+
+def body_interaction(
+    centroids: torch.Tensor, body_of_face: torch.Tensor | None, bodies: BodyMeshes, next_vertices: torch.Tensor
+) -> BodyInteraction:
+    """The nearest body point of each garment face, and how the body face there moves in the coming frame.
+
+    Args:
+        centroids: Centroids of the garment's faces [m], float32 [F, 3].
+        body_of_face: Body of each garment face, int32 [F]; None if there is one body.
+        bodies: The bodies at time t.
+        next_vertices: Their vertices at t+1 [m], float32 [U, 3].
+
+    Returns:
+        See `BodyInteraction`; without gradients.
+    """
+    expect("centroids", centroids, (None, 3), device=bodies.device)
+    expect("next_vertices", next_vertices, tuple(bodies.vertices.shape), device=bodies.device)
+    body_of_face = bodies.body_of("body_of_face", body_of_face, len(centroids))
+    centroids, next_vertices = centroids.detach(), next_vertices.detach()
+    rows, device = len(centroids), bodies.device
+    found = BodyInteraction(
+        closest=allocate((rows, 3), torch.float32, device),
+        sign=allocate((rows,), torch.float32, device),
+        face=allocate((rows,), torch.int32, device),
+        deformation=allocate((rows, 3, 3), torch.float32, device),
+        velocity=allocate((rows, 3), torch.float32, device),
+    )
+    if rows:
+        with torch_stream(device) as warp_device:
+            wp.launch(
+                body_interaction_kernel,
+                dim=rows,
+                inputs=[
+                    bodies.model,
+                    as_argument(centroids, wp.vec3),
+                    as_argument(body_of_face, wp.int32),
+                    as_argument(next_vertices, wp.vec3),
+                ],
+                outputs=[
+                    as_argument(found.closest, wp.vec3),
+                    as_argument(found.sign, wp.float32),
+                    as_argument(found.face, wp.int32),
+                    as_argument(found.deformation, wp.mat33),
+                    as_argument(found.velocity, wp.vec3),
+                ],
+                device=warp_device,
+            )
+    return found
+
+
+def face_features(
+    inverse_rest: torch.Tensor,
+    vertices: torch.Tensor,
+    faces: torch.Tensor,
+    garment_of_face: torch.Tensor,
+    garment_mean: torch.Tensor,
+    interaction: BodyInteraction,
+) -> torch.Tensor:
+    """The network's input for one frame, not normalised.
+
+    Distance and direction are those from the present centroids to `interaction.closest`, so an interaction may serve a
+    garment that was moved a little since.
+
+    Args:
+        inverse_rest: From `deformation.inverse_rest_frames`, float32 [F, 3, 3].
+        vertices: Garment positions [m], float32 [V, 3].
+        faces: int32 [F, 3].
+        garment_of_face: Garment each face belongs to, int32 [F].
+        garment_mean: Mean of the face centroids of each garment [m], float32 [B, 3].
+        interaction: From `body_interaction`.
+
+    Returns:
+        float32 [F, 34]; columns as in `LAYOUT`. Differentiable in vertices and garment_mean.
+    """
+    expect_mesh(vertices, faces)
+    rows, device = faces.shape[0], vertices.device
+    expect("inverse_rest", inverse_rest, (rows, 3, 3), device=device)
+    expect("garment_of_face", garment_of_face, (rows,), torch.int32, device)
+    expect("garment_mean", garment_mean, (None, 3), device=device)
+    expect("interaction.closest", interaction.closest, (rows, 3), device=device)
+    expect("interaction.sign", interaction.sign, (rows,), device=device)
+    expect("interaction.deformation", interaction.deformation, (rows, 3, 3), device=device)
+    expect("interaction.velocity", interaction.velocity, (rows, 3), device=device)
+    return _face_features(
+        inverse_rest,
+        vertices,
+        faces,
+        garment_of_face,
+        garment_mean,
+        interaction.closest,
+        interaction.sign,
+        interaction.deformation,
+        interaction.velocity,
+    )

@@ -1,0 +1,308 @@
+"""Conjugate gradients for many small systems at once: one thread block per connected component.
+
+Supplement sections 1.3 and 2 both end in a symmetric positive (semi-)definite system of this form:
+
+    A x = b,    A = S ⊗ I₃ + blockdiag(n_i n_iᵀ),    S sparse and constant per garment
+
+The 3x3 diagonal blocks s_ii I + n_i n_iᵀ are inverted by Sherman-Morrison, which gives the block-Jacobi preconditioner
+
+    M⁻¹ r = r / s - n (n·r) / (s (s + n·n))
+
+The decrease of the squared error in the energy norm, |e|² = eᵀ A e, is known exactly: step k lowers it by
+α_k r_kᵀ M⁻¹ r_k (Hestenes and Stiefel 1952). The iteration stops when what is left of it, judged from the last two
+windows of `WINDOW` steps, falls below the tolerance. All vectors are float64, which on one CPU core costs 0.18 ms an
+iteration for 5,000 vertices, hardly more than float32 (0.16 ms), and leaves no stagnation to guard against.
+
+| symbol | code | what |
+| --- | --- | --- |
+| S | `row_pointer, column, value` | CSR, [V,V], float64 |
+| s_ii | `diagonal` | [V] |
+| n_i | `normal` | [V,3]; zero where a vertex has no contact |
+| b, x | `rhs, solution` | [V,3] |
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import descriptor, torch_stream
+from warpgarment.kernels.operator import allocate
+
+WINDOW = 8
+_WINDOW = wp.constant(WINDOW)  # as the kernels see it
+
+
+@wp.func
+def block_sum(value: wp.float64) -> wp.float64:
+    """Sum over the lanes of a block, handed to all; also a barrier: what was written before is visible after."""
+    return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
+
+
+@wp.func
+def precondition(s: wp.float64, n: wp.vec3d, r: wp.vec3d) -> wp.vec3d:
+    """(s I + n nᵀ)⁻¹ r; zero for an empty row."""
+    z = wp.vec3d()
+    if s > wp.float64(0.0):
+        z = r / s - n * (wp.dot(n, r) / (s * (s + wp.dot(n, n))))
+    return z
+
+
+@wp.kernel(enable_backward=False)
+def conjugate_gradients(
+    # System:
+    start: wp.array[wp.int32],
+    rows: wp.array[wp.int32],
+    row_pointer: wp.array[wp.int32],
+    column: wp.array[wp.int32],
+    value: wp.array[wp.float64],
+    diagonal: wp.array[wp.float64],
+    normal: wp.array[wp.vec3d],
+    # In:
+    rhs: wp.array[wp.vec3d],
+    tolerance: wp.array[wp.float64],
+    relative: wp.float64,
+    max_iterations: wp.int32,
+    # Work:
+    residual: wp.array[wp.vec3d],
+    direction: wp.array[wp.vec3d],
+    image: wp.array[wp.vec3d],
+    # Out:
+    solution: wp.array[wp.vec3d],
+    report: wp.array[wp.int32],
+    error: wp.array[wp.float64],
+):
+    """Solves one component; `report` is the number of iterations, negative if the limit ended them."""
+    component, lane = wp.tid()
+    first = start[component] + lane
+    end = start[component + 1]
+    stride = wp.block_dim()
+    zero = wp.float64(0.0)
+
+    rz = wp.float64(0.0)
+    k = first
+    while k < end:
+        i = rows[k]
+        b = rhs[i]
+        z = precondition(diagonal[i], normal[i], b)
+        solution[i] = wp.vec3d()
+        residual[i] = b
+        direction[i] = z
+        rz += wp.dot(b, z)
+        k += stride
+    rz = block_sum(rz)
+
+    goal = tolerance[component] * tolerance[component]
+    total = wp.float64(0.0)  # energy of the solution so far, |x|² in the energy norm
+    window = wp.float64(0.0)
+    previous = wp.float64(0.0)
+    left = wp.float64(0.0)  # what is thought to be left of the squared error
+    iteration = wp.int32(0)
+    running = rz > zero
+    while running and iteration < max_iterations:
+        pq = wp.float64(0.0)
+        k = first
+        while k < end:
+            i = rows[k]
+            p = direction[i]
+            s = normal[i] * wp.dot(normal[i], p)
+            for e in range(row_pointer[i], row_pointer[i + 1]):
+                s += value[e] * direction[column[e]]
+            image[i] = s
+            pq += wp.dot(p, s)
+            k += stride
+        pq = block_sum(pq)
+        alpha = zero
+        if pq > zero:
+            alpha = rz / pq
+
+        rz_next = wp.float64(0.0)
+        k = first
+        while k < end:
+            i = rows[k]
+            solution[i] = solution[i] + alpha * direction[i]
+            r = residual[i] - alpha * image[i]
+            residual[i] = r
+            rz_next += wp.dot(r, precondition(diagonal[i], normal[i], r))
+            k += stride
+        rz_next = block_sum(rz_next)
+
+        beta = rz_next / rz
+        k = first
+        while k < end:
+            i = rows[k]
+            direction[i] = precondition(diagonal[i], normal[i], residual[i]) + beta * direction[i]
+            k += stride
+
+        window += alpha * rz
+        total += alpha * rz
+        iteration += 1
+        running = rz_next > zero and alpha > zero
+        if iteration % _WINDOW == 0:
+            rate = wp.float64(0.98)
+            if previous > zero:
+                rate = wp.min(window / previous, rate)
+            left = window * rate / (wp.float64(1.0) - rate)
+            running = running and left > wp.max(goal, relative * relative * total)
+            previous = window
+            window = zero
+        rz = block_sum(rz_next) / wp.float64(stride)  # the sum is the barrier between direction and the next product
+
+    if not (rz >= zero):  # a right-hand side or matrix with NaN must not look like a solution
+        k = first
+        while k < end:
+            solution[rows[k]] = wp.vec3d(rz)
+            k += stride
+    if lane == 0:
+        report[component] = wp.where(running, -iteration, iteration)
+        error[component] = wp.sqrt(wp.max(left, window))
+
+
+class System(NamedTuple):
+    """The constant part of the systems of a packed batch, on one device."""
+
+    start: torch.Tensor
+    """int32 [C+1], where the vertices of a component begin in `rows`."""
+    rows: torch.Tensor
+    """int32 [V], vertices sorted by component."""
+    row_pointer: torch.Tensor
+    column: torch.Tensor
+    value: torch.Tensor
+    diagonal: torch.Tensor
+
+    @classmethod
+    def build(cls, matrix: scipy.sparse.csr_matrix, vertex_component: np.ndarray, count: int, device: object) -> System:
+        """Moves a host matrix [V,V] to the device. No entry may join two components."""
+        matrix = matrix.tocsr()
+        rows = np.argsort(vertex_component, kind="stable").astype(np.int32)
+        start = np.searchsorted(vertex_component[rows], np.arange(count + 1)).astype(np.int32)
+        host = (start, rows, matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data)
+        return cls(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in (*host, matrix.diagonal())))
+
+
+def view(tensor: torch.Tensor, dtype: type) -> object:
+    """The descriptor of a contiguous tensor as a launch argument; keeps nothing alive and costs a tenth of an array."""
+    if tensor.numel() == 0:
+        tensor = tensor.new_empty(tensor.shape)  # slices of nothing have strides that Warp refuses
+    return descriptor(tensor, dtype)
+
+
+def block_dim(device: torch.device, vertices: int, count: int) -> int:
+    """Lanes of a block: the CPU has one; a GPU takes more for large components than for small ones."""
+    if device.type == "cpu":
+        return 256 if wp.config.enable_cpu_blocks else 1
+    mean = vertices / max(count, 1)
+    return 128 if mean < 256 else 256 if mean < 4096 else 512
+
+
+def solve(
+    system: System | list[torch.Tensor],
+    normal: torch.Tensor,
+    rhs: torch.Tensor,
+    tolerance: torch.Tensor,
+    relative: float,
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Solves A x = b for every component, from zero.
+
+    Args:
+        system: The constant part of A.
+        normal: n, float64 [V,3].
+        rhs: b, float64 [V,3].
+        tolerance: Error allowed in the energy norm, float64 [C].
+        relative: The same as a share of the energy norm of the solution; the looser of the two holds.
+        max_iterations: Limit per component.
+
+    Returns:
+        x float64 [V,3]; iterations int32 [C], negative where the limit ended them; estimated error float64 [C].
+    """
+    system = System(*system)
+    count, vertices = len(system.start) - 1, len(rhs)
+    residual, direction, image, solution = allocate((4, vertices, 3), torch.float64, rhs.device)
+    report, error = allocate((count,), torch.int32, rhs.device), allocate((count,), torch.float64, rhs.device)
+    if count == 0:
+        return solution, report, error
+    integers = [view(t, wp.int32) for t in (system.start, system.rows, system.row_pointer, system.column)]
+    with torch_stream(rhs.device) as device:
+        wp.launch_tiled(
+            conjugate_gradients,
+            dim=[count],
+            inputs=[
+                *integers,
+                view(system.value, wp.float64),
+                view(system.diagonal, wp.float64),
+                view(normal, wp.vec3d),
+                view(rhs, wp.vec3d),
+                view(tolerance, wp.float64),
+                float(relative),
+                int(max_iterations),
+                view(residual, wp.vec3d),
+                view(direction, wp.vec3d),
+                view(image, wp.vec3d),
+                view(solution, wp.vec3d),
+                view(report, wp.int32),
+                view(error, wp.float64),
+            ],
+            block_dim=block_dim(rhs.device, vertices, count),
+            device=device,
+        )
+    return solution, report, error
+
+
+class Progress:
+    """What the last solve of a solver reported. Reading it on a GPU waits for the solve."""
+
+    def __init__(self, what: str) -> None:
+        self.what = what
+        self._solves: list[tuple[torch.Tensor, torch.Tensor]] = []
+        self._limit = 0
+        self._warned = False
+
+    def record(self, report: torch.Tensor, error: torch.Tensor, limit: int, *, add: bool = False) -> None:
+        """Keeps a report, beside the earlier ones if `add`; on the CPU it is looked at straight away."""
+        self._solves = [*(self._solves if add else []), (report, error)]
+        self._limit = limit
+        if report.device.type == "cpu":
+            self._warn(report, error)
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the last solve, the largest of all components; solves recorded together are summed."""
+        for solve in self._solves:
+            self._warn(*solve)
+        return sum(int(report.abs().max()) for report, _ in self._solves if len(report))
+
+    def summary(self) -> torch.Tensor:
+        """`iterations`, components stopped by the limit, their largest error [m]; float64 [3] on the device.
+
+        Does not wait for the solve: hand it to `tell` once it has been read.
+        """
+        reports, errors = (torch.stack(tensors) for tensors in zip(*self._solves, strict=True))
+        if not reports.shape[1]:
+            return errors.new_zeros(3)
+        stopped = reports < 0
+        iterations = reports.abs().amax(1).sum()
+        return torch.stack([iterations.double(), stopped.sum().double(), torch.where(stopped, errors, 0.0).max()])
+
+    def tell(self, stopped: float, components: int, error: float) -> None:
+        """Warns, once, if components were stopped by the limit."""
+        if self._warned or not stopped:
+            return
+        self._warned = True
+        warnings.warn(
+            f"{self.what}: {int(stopped)} of {components} components stopped at max_iterations={self._limit} "
+            f"with an error of about {error:.1e} m in the energy norm; raise max_iterations, "
+            "or look for slivers in the rest mesh",
+            RuntimeWarning,
+            stacklevel=5,
+        )
+
+    def _warn(self, report: torch.Tensor, error: torch.Tensor) -> None:
+        stopped = report < 0
+        if not self._warned and bool(stopped.any()):
+            self.tell(int(stopped.sum()), len(report), float(error[stopped].max()))

@@ -1,0 +1,270 @@
+"""A x = b for every component that has a factor (factor.py), with three right-hand sides at once.
+
+By substitution, a component per thread, four places at a time, as a CPU likes it:
+
+    for k upwards:      x_k = b_k - Σ_{j<k} L_kj x_j,    for k downwards:  x_k = x_k / D_k - Σ_{j>k} L_jk x_j
+
+or by two sparse products, x = Wᵀ D⁻¹ W b, a row per block of lanes, as a GPU likes it. Work vectors are in elimination
+order, with a fourth number that is zero, since four doubles fit a vector register and three don't.
+
+| symbol | code | what |
+| --- | --- | --- |
+| b, x | `rhs, solution` | [V,3], float64 |
+| `start, rows` | as in System | vertices sorted by component |
+| the rest | as in factor.Factor | |
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.operator import allocate
+
+from .conjugate_gradients import System, block_dim, block_sum, view
+from .factor import Factor
+
+LANES = 32
+"""Lanes that share a row on a GPU."""
+
+
+@wp.func
+def padded(v: wp.vec3d) -> wp.vec4d:
+    return wp.vec4d(v[0], v[1], v[2], wp.float64(0.0))
+
+
+@wp.func
+def eliminate(
+    panel: int,
+    place: int,
+    first: int,
+    pivot: wp.array[wp.vec4d],
+    triangle: wp.array[wp.mat44d],
+    pointer: wp.array[wp.int32],
+    row: wp.array[wp.int32],
+    value: wp.array[wp.vec4d],
+    x: wp.array[wp.vec4d],
+):
+    """The sweep upwards at the four places of a panel; after all of them x is D⁻¹ L⁻¹ x."""
+    t = triangle[panel]
+    x0 = x[place]
+    x1 = x[place + 1] - t[1, 0] * x0
+    x2 = x[place + 2] - t[2, 0] * x0 - t[2, 1] * x1
+    x3 = x[place + 3] - t[3, 0] * x0 - t[3, 1] * x1 - t[3, 2] * x2
+    e = pointer[panel]
+    last = pointer[panel + 1]
+    while e < last:
+        j = first + row[e]
+        v = value[e]
+        x[j] = (x[j] - v[0] * x0 - v[1] * x1) - (v[2] * x2 + v[3] * x3)
+        e += 1
+    d = pivot[panel]
+    x[place] = d[0] * x0
+    x[place + 1] = d[1] * x1
+    x[place + 2] = d[2] * x2
+    x[place + 3] = d[3] * x3
+
+
+@wp.func
+def substitute_back(
+    panel: int,
+    place: int,
+    first: int,
+    triangle: wp.array[wp.mat44d],
+    pointer: wp.array[wp.int32],
+    row: wp.array[wp.int32],
+    value: wp.array[wp.vec4d],
+    x: wp.array[wp.vec4d],
+):
+    """The sweep downwards at the four places of a panel; after all of them x is L⁻ᵀ x."""
+    x0 = x[place]
+    x1 = x[place + 1]
+    x2 = x[place + 2]
+    x3 = x[place + 3]
+    e = pointer[panel]
+    last = pointer[panel + 1]
+    while e < last:
+        s = x[first + row[e]]
+        v = value[e]
+        x0 -= v[0] * s
+        x1 -= v[1] * s
+        x2 -= v[2] * s
+        x3 -= v[3] * s
+        e += 1
+    t = triangle[panel]
+    x2 -= t[3, 2] * x3
+    x1 -= t[2, 1] * x2 + t[3, 1] * x3
+    x0 -= t[1, 0] * x1 + t[2, 0] * x2 + t[3, 0] * x3
+    x[place] = x0
+    x[place + 1] = x1
+    x[place + 2] = x2
+    x[place + 3] = x3
+
+
+@wp.kernel(enable_backward=False)
+def substitute(
+    # Model:
+    start: wp.array[wp.int32],
+    rows: wp.array[wp.int32],
+    base: wp.array[wp.int32],
+    work: wp.array[wp.int32],
+    order: wp.array[wp.int32],
+    pivot: wp.array[wp.vec4d],
+    triangle: wp.array[wp.mat44d],
+    pointer: wp.array[wp.int32],
+    row: wp.array[wp.int32],
+    value: wp.array[wp.vec4d],
+    # In:
+    rhs: wp.array[wp.vec3d],
+    # Work:
+    x: wp.array[wp.vec4d],
+    # Out:
+    solution: wp.array[wp.vec3d],
+):
+    """A component per thread; those without a factor are left as they are."""
+    component = wp.tid()
+    b = base[component]
+    if b >= 0:
+        begin = start[component]
+        first = work[component]
+        panels = (start[component + 1] - begin + 3) / 4
+        for k in range(4 * panels):
+            v = order[b + k]
+            x[first + k] = wp.vec4d()
+            if v >= 0:
+                x[first + k] = padded(rhs[rows[begin + v]])
+        for q in range(panels):
+            eliminate(b / 4 + q, first + 4 * q, first, pivot, triangle, pointer, row, value, x)
+        for m in range(panels):
+            q = panels - 1 - m
+            substitute_back(b / 4 + q, first + 4 * q, first, triangle, pointer, row, value, x)
+        for k in range(4 * panels):
+            v = order[b + k]
+            if v >= 0:
+                d = x[first + k]
+                solution[rows[begin + v]] = wp.vec3d(d[0], d[1], d[2])
+
+
+@wp.kernel(enable_backward=False)
+def multiply_lower(
+    # Model:
+    start: wp.array[wp.int32],
+    rows: wp.array[wp.int32],
+    vertex_component: wp.array[wp.int32],
+    base: wp.array[wp.int32],
+    order: wp.array[wp.int32],
+    pivot: wp.array[wp.float64],
+    pointer: wp.array[wp.int32],
+    column: wp.array[wp.int32],
+    value: wp.array[wp.float64],
+    # In:
+    rhs: wp.array[wp.vec3d],
+    # Out:
+    x: wp.array[wp.vec3d],
+):
+    """x = D⁻¹ W b, in elimination order, a place per block."""
+    place, lane = wp.tid()
+    component = vertex_component[rows[place]]
+    b = base[component]
+    if b >= 0:
+        first = start[component]
+        k = b + place - first
+        s = wp.vec3d()
+        e = pointer[k] + lane
+        while e < pointer[k + 1]:
+            s += value[e] * rhs[rows[first + order[b + column[e]]]]
+            e += wp.block_dim()
+        s = wp.vec3d(block_sum(s[0]), block_sum(s[1]), block_sum(s[2]))
+        if lane == 0:
+            x[place] = pivot[k] * (s + rhs[rows[first + order[k]]])
+
+
+@wp.kernel(enable_backward=False)
+def multiply_upper(
+    # Model:
+    start: wp.array[wp.int32],
+    rows: wp.array[wp.int32],
+    vertex_component: wp.array[wp.int32],
+    base: wp.array[wp.int32],
+    order: wp.array[wp.int32],
+    pointer: wp.array[wp.int32],
+    column: wp.array[wp.int32],
+    value: wp.array[wp.float64],
+    # In:
+    x: wp.array[wp.vec3d],
+    # Out:
+    solution: wp.array[wp.vec3d],
+):
+    """Wᵀ x, a place per block; components without a factor are left as they are."""
+    place, lane = wp.tid()
+    component = vertex_component[rows[place]]
+    b = base[component]
+    if b >= 0:
+        first = start[component]
+        k = b + place - first
+        s = wp.vec3d()
+        e = pointer[k] + lane
+        while e < pointer[k + 1]:
+            s += value[e] * x[first + column[e]]
+            e += wp.block_dim()
+        s = wp.vec3d(block_sum(s[0]), block_sum(s[1]), block_sum(s[2]))
+        if lane == 0:
+            solution[rows[first + order[k]]] = s + x[place]
+
+
+def solve(
+    system: System,
+    factor: Factor,
+    vertex_component: torch.Tensor,
+    rhs: torch.Tensor,
+    solution: torch.Tensor,
+) -> None:
+    """Writes x of the components that have a factor.
+
+    Args:
+        system: Which vertices belong to a component.
+        factor: Their factors.
+        vertex_component: int32 [V].
+        rhs: b, float64 [V,3].
+        solution: x, float64 [V,3]; rows of other components are not touched.
+    """
+    if len(rhs) == 0 or not int(factor.counts[0]):
+        return
+    common = [view(system.start, wp.int32), view(system.rows, wp.int32)]
+    load, result = view(rhs, wp.vec3d), view(solution, wp.vec3d)
+    with torch_stream(rhs.device) as device:
+        if not int(factor.counts[2]):
+            scratch = allocate((int(factor.counts[3]), 4), torch.float64, rhs.device)
+            inputs = [*common, *substitution(factor), load, view(scratch, wp.vec4d), result]
+            wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
+            return
+        base, order = view(factor.base, wp.int32), view(factor.order, wp.int32)
+        columns, rows = (
+            [view(pointer, wp.int32), view(column, wp.int32), view(value, wp.float64)]
+            for pointer, column, value in (
+                (factor.pointer, factor.column, factor.value),
+                (factor.row_pointer, factor.row_column, factor.row_value),
+            )
+        )
+        common += [view(vertex_component, wp.int32), base, order]
+        scratch = allocate(rhs.shape, torch.float64, rhs.device)
+        work = view(scratch, wp.vec3d)
+        block = LANES if rhs.is_cuda else block_dim(rhs.device, len(rhs), 1)
+        first = [*common, view(factor.pivot, wp.float64), *rows, load, work]
+        second = [*common, *columns, work, result]
+        wp.launch_tiled(multiply_lower, dim=[len(rhs)], inputs=first, block_dim=block, device=device)
+        wp.launch_tiled(multiply_upper, dim=[len(rhs)], inputs=second, block_dim=block, device=device)
+
+
+def substitution(factor: Factor) -> list[object]:
+    """A factor in the form for substitution as launch arguments, `base` to `value` of `substitute`."""
+    integers = [view(t, wp.int32) for t in (factor.base, factor.first, factor.order)]
+    return [
+        *integers,
+        view(factor.pivot.view(-1, 4), wp.vec4d),
+        view(factor.triangle, wp.mat44d),
+        view(factor.pointer, wp.int32),
+        view(factor.column, wp.int32),
+        view(factor.value.view(-1, 4), wp.vec4d),
+    ]

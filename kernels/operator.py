@@ -1,0 +1,151 @@
+"""Turns a Warp kernel with one thread per row into a differentiable torch operator.
+
+The operator is a `torch.library.custom_op` with a fake implementation, so `torch.compile` and `torch.export` accept
+it; its backward is a second custom operator that launches the kernel's adjoint. Tensors go in and out without copies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+import warp as wp
+
+from .launch import as_argument, as_warp, torch_stream
+
+Outputs = dict[str, tuple[type, tuple[int, ...]]]  # name -> (Warp element type, shape of one row)
+
+
+def allocate(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Memory for an output. The kernel writes all of it: tests replace this function by one that fills in NaN."""
+    return torch.empty(tuple(shape), dtype=dtype, device=device)
+
+
+def launch(
+    kernel: wp.Kernel,
+    rows: int,
+    inputs: Sequence[tuple[torch.Tensor, type]],
+    outputs: Sequence[tuple[torch.Tensor, type]],
+    device: torch.device,
+) -> None:
+    """Runs a kernel forward over `rows` threads on torch's stream. No rows, no launch."""
+    if rows == 0:
+        return
+    with torch_stream(device) as warp_device:
+        wp.launch(
+            kernel,
+            dim=rows,
+            inputs=[as_argument(tensor, dtype) for tensor, dtype in inputs],
+            outputs=[as_argument(tensor, dtype) for tensor, dtype in outputs],
+            device=warp_device,
+        )
+
+
+def row_operator(
+    name: str,
+    kernel: wp.Kernel,
+    inputs: dict[str, type],
+    outputs: Outputs,
+    *,
+    rows: str,
+    gradients: Sequence[str] = (),
+) -> Callable[..., Any]:
+    """Registers `warpgarment::name`, an operator that runs `kernel` once per row.
+
+    Args:
+        name: Operator name; the backward is called `name_backward`.
+        kernel: Takes the inputs, then the outputs; thread i writes row i of every output.
+        inputs: Name and Warp element type of each tensor, in the kernel's order.
+        outputs: Name, Warp element type and row shape of each result, in the kernel's order.
+        rows: The input whose length is the number of rows.
+        gradients: The inputs that gradients flow to.
+
+    Returns:
+        The operator: tensors in, in the order of `inputs`; one tensor, or a tuple of them, out. It checks nothing.
+    """
+    names, types = list(inputs), list(inputs.values())
+    kinds = [kind for kind, _ in outputs.values()]
+    row_index, wanted = names.index(rows), [names.index(n) for n in gradients]
+
+    def torch_type(warp_type: type) -> torch.dtype:
+        return wp.dtype_to_torch(getattr(warp_type, "_wp_scalar_type_", warp_type))
+
+    def empty_outputs(tensors: Sequence[torch.Tensor], new: Callable[..., torch.Tensor]) -> list[torch.Tensor]:
+        at = tensors[row_index]
+        return [new((at.shape[0], *tail), dtype=torch_type(kind), device=at.device) for kind, tail in outputs.values()]
+
+    def unpacked(results: list[torch.Tensor]) -> Any:
+        return results[0] if len(results) == 1 else tuple(results)
+
+    def forward(*tensors: torch.Tensor) -> Any:
+        results = empty_outputs(tensors, allocate)
+        arguments, found = zip(tensors, types, strict=True), zip(results, kinds, strict=True)
+        at = tensors[row_index]
+        launch(kernel, at.shape[0], list(arguments), list(found), at.device)
+        return unpacked(results)
+
+    def fake(*tensors: torch.Tensor) -> Any:
+        return unpacked(empty_outputs(tensors, torch.empty))
+
+    operator = torch.library.custom_op(
+        f"warpgarment::{name}", forward, mutates_args=(), schema=_schema(names, len(outputs))
+    )
+    operator.register_fake(fake)
+    if not wanted:
+        return operator
+
+    def backward(*tensors: torch.Tensor) -> Any:
+        arguments, incoming = tensors[: len(names)], tensors[len(names) :]
+        found = [torch.zeros(arguments[i].shape, dtype=torch.float32, device=arguments[i].device) for i in wanted]
+        at = arguments[row_index]
+        if at.shape[0] == 0:
+            return unpacked(found)
+        adjoints: list[wp.array | None] = [None] * len(names)
+        for i, gradient in zip(wanted, found, strict=True):
+            adjoints[i] = as_warp(gradient, types[i])
+        # The adjoint writes into the incoming gradients, which autograd may still hold: it gets a copy. It replays the
+        # forward pass too, into memory of its own.
+        copies = [torch.clone(g, memory_format=torch.contiguous_format) for g in incoming]
+        scratch = empty_outputs(arguments, torch.empty)
+        with torch_stream(at.device) as warp_device:
+            wp.launch(
+                kernel,
+                dim=at.shape[0],
+                inputs=[as_warp(t, kind) for t, kind in zip(arguments, types, strict=True)],
+                outputs=[as_warp(t, kind) for t, kind in zip(scratch, kinds, strict=True)],
+                adj_inputs=adjoints,
+                adj_outputs=[as_warp(t, kind) for t, kind in zip(copies, kinds, strict=True)],
+                adjoint=True,
+                device=warp_device,
+            )
+        return unpacked(found)
+
+    def fake_backward(*tensors: torch.Tensor) -> Any:
+        return unpacked([torch.empty(tensors[i].shape, device=tensors[i].device) for i in wanted])
+
+    backward_operator = torch.library.custom_op(
+        f"warpgarment::{name}_backward",
+        backward,
+        mutates_args=(),
+        schema=_schema(names + [f"grad_{n}" for n in outputs], len(wanted)),
+    )
+    backward_operator.register_fake(fake_backward)
+
+    def save(ctx: Any, inputs: tuple[torch.Tensor, ...], output: Any) -> None:
+        ctx.save_for_backward(*inputs)
+
+    def pull_back(ctx: Any, *incoming: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        results = backward_operator(*ctx.saved_tensors, *incoming)
+        found: list[torch.Tensor | None] = [None] * len(names)
+        for i, gradient in zip(wanted, results if len(wanted) > 1 else [results], strict=True):
+            found[i] = gradient if ctx.needs_input_grad[i] else None
+        return tuple(found)
+
+    operator.register_autograd(pull_back, setup_context=save)
+    return operator
+
+
+def _schema(arguments: Sequence[str], results: int) -> str:
+    returned = "Tensor" if results == 1 else "(" + ", ".join(["Tensor"] * results) + ")"
+    return "(" + ", ".join(f"Tensor {name}" for name in arguments) + f") -> {returned}"

@@ -1,0 +1,214 @@
+"""The Poisson solve as a differentiable torch operator. Equations and symbols: solver.py."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.linear import conjugate_gradients, triangular
+from warpgarment.kernels.linear.conjugate_gradients import System, block_dim, view
+from warpgarment.kernels.linear.factor import Factor
+from warpgarment.kernels.operator import allocate
+
+from .kernels import phi_adjoint, place, place_adjoint, right_hand_side
+
+ADJOINT_TOLERANCE = 1e-6
+"""Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
+
+# The tensors of a solver travel through the operators as one list, in this order; System and Factor follow.
+MODEL = (
+    ("rest_vertices", wp.vec3),
+    ("faces", wp.int32),
+    ("half_cotangent", wp.float64),
+    ("corner_start", wp.int32),
+    ("corners", wp.int32),
+    ("corner_edge", wp.vec3d),
+    ("pin_of_vertex", wp.int32),
+    ("pin_stiffness", wp.float64),
+    ("pins", None),
+    ("vertex_component", None),
+    ("pins_in_component", None),
+    ("kind", wp.int32),
+    ("centroid_weight", wp.float64),
+    ("no_normal", wp.vec3d),
+    ("tolerance", None),
+)
+_SYSTEM = len(MODEL)
+_FACTOR = _SYSTEM + len(System._fields)
+
+
+def _views(model: list[torch.Tensor]) -> dict[str, object]:
+    names = zip(MODEL, model[:_SYSTEM], strict=True)
+    return {name: view(tensor, dtype) for (name, dtype), tensor in names if dtype is not None}
+
+
+def _start_rows(model: list[torch.Tensor]) -> list[object]:
+    return [view(tensor, wp.int32) for tensor in model[_SYSTEM : _SYSTEM + 2]]
+
+
+def _solve(
+    model: list[torch.Tensor], rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(L + W) D = g: directly where there is a factor, or else as `conjugate_gradients.solve`, which says what is
+    returned."""
+    system, factor = System(*model[_SYSTEM:_FACTOR]), Factor(*model[_FACTOR:])
+    tensors = _named(model)
+    if int(factor.counts[1]):
+        load = factor.without(rhs, tensors["vertex_component"])
+        solution, report, error = conjugate_gradients.solve(
+            system, tensors["no_normal"], load, tolerance, relative, max_iterations
+        )
+    else:
+        solution = allocate(rhs.shape, torch.float64, rhs.device)
+        report, error = torch.zeros_like(tolerance, dtype=torch.int32), torch.zeros_like(tolerance)
+    triangular.solve(system, factor, tensors["vertex_component"], rhs, solution)
+    return solution, report, error
+
+
+def _named(model: list[torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: tensor for (name, _), tensor in zip(MODEL, model[:_SYSTEM], strict=True)}
+
+
+@torch.library.custom_op("warpgarment::poisson_solve", mutates_args=())
+def poisson_solve(
+    phi: torch.Tensor,
+    mean: torch.Tensor,
+    pin_target: torch.Tensor,
+    initial: torch.Tensor,
+    model: list[torch.Tensor],
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The solve on tensors alone; see `PoissonSolver.solve`. Returns vertices, iterations and error per component."""
+    tensors, m, count = _named(model), _views(model), len(mean)
+    phi, mean, pin_target = phi.contiguous(), mean.contiguous(), pin_target.contiguous()
+    guess = initial.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
+    if len(pin_target):  # the translation of a pinned component that its pins agree on
+        pins = tensors["pins"]
+        offset = torch.zeros((count, 3), dtype=torch.float64, device=phi.device)
+        offset.index_add_(0, tensors["vertex_component"][pins], pin_target.double() - guess[pins])
+        guess += (offset / tensors["pins_in_component"].clamp(min=1.0))[tensors["vertex_component"]]
+    rhs = allocate(guess.shape, torch.float64, phi.device)
+    vertices = allocate(guess.shape, torch.float32, phi.device)
+    if count == 0:
+        return vertices, vertices.new_empty(0, dtype=torch.int32), vertices.new_empty(0, dtype=torch.float64)
+    with torch_stream(phi.device) as device:
+        wp.launch(
+            right_hand_side,
+            dim=len(guess),
+            inputs=[
+                view(tensors["faces"], wp.vec3i),
+                view(tensors["half_cotangent"], wp.vec3d),
+                m["corner_start"],
+                m["corners"],
+                m["corner_edge"],
+                m["pin_of_vertex"],
+                m["pin_stiffness"],
+                view(phi, wp.mat33),
+                view(guess, wp.vec3d),
+                view(pin_target, wp.vec3),
+                view(rhs, wp.vec3d),
+            ],
+            device=device,
+        )
+        increment, report, error = _solve(model, rhs, tensors["tolerance"], 0.0, max_iterations)
+        wp.launch_tiled(
+            place,
+            dim=[count],
+            inputs=[
+                *_start_rows(model),
+                m["kind"],
+                m["centroid_weight"],
+                view(guess, wp.vec3d),
+                view(increment, wp.vec3d),
+                view(mean, wp.vec3),
+                view(vertices, wp.vec3),
+            ],
+            block_dim=block_dim(phi.device, len(guess), count),
+            device=device,
+        )
+    return vertices, report, error
+
+
+@poisson_solve.register_fake
+def _(phi, mean, pin_target, initial, model, max_iterations):
+    count = mean.shape[0]
+    return (
+        torch.empty_like(initial, memory_format=torch.contiguous_format),
+        mean.new_empty(count, dtype=torch.int32),
+        mean.new_empty(count, dtype=torch.float64),
+    )
+
+
+@torch.library.custom_op("warpgarment::poisson_solve_backward", mutates_args=())
+def poisson_solve_backward(
+    grad_vertices: torch.Tensor, mean: torch.Tensor, model: list[torch.Tensor], max_iterations: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Gradients with respect to phi, mean and pin_target: one solve with the same matrix."""
+    tensors, m, count = _named(model), _views(model), len(mean)
+    grad_vertices = grad_vertices.contiguous()
+    rhs = allocate(grad_vertices.shape, torch.float64, mean.device)
+    grad_mean = allocate(mean.shape, torch.float32, mean.device)
+    grad_phi = allocate((len(tensors["faces"]), 3, 3), torch.float32, mean.device)
+    if count == 0:
+        return grad_phi, grad_mean, mean.new_empty((0, 3))
+    with torch_stream(mean.device) as device:
+        wp.launch_tiled(
+            place_adjoint,
+            dim=[count],
+            inputs=[
+                *_start_rows(model),
+                m["kind"],
+                m["centroid_weight"],
+                view(grad_vertices, wp.vec3),
+                view(rhs, wp.vec3d),
+                view(grad_mean, wp.vec3),
+            ],
+            block_dim=block_dim(mean.device, len(rhs), count),
+            device=device,
+        )
+        exactly = torch.zeros_like(tensors["tolerance"])
+        adjoint, _, _ = _solve(model, rhs, exactly, ADJOINT_TOLERANCE, max_iterations)
+        wp.launch(
+            phi_adjoint,
+            dim=len(grad_phi),
+            inputs=[
+                m["rest_vertices"],
+                m["faces"],
+                m["half_cotangent"],
+                view(adjoint, wp.vec3d),
+                view(grad_phi, wp.float32),
+            ],
+            device=device,
+        )
+    pins = tensors["pins"]
+    grad_pins = (tensors["pin_stiffness"][pins, None] * adjoint[pins]).to(torch.float32)
+    return grad_phi, grad_mean, grad_pins
+
+
+@poisson_solve_backward.register_fake
+def _(grad_vertices, mean, model, max_iterations):
+    tensors = _named(model)
+    return (
+        mean.new_empty((tensors["faces"].shape[0], 3, 3)),
+        torch.empty_like(mean, memory_format=torch.contiguous_format),
+        mean.new_empty((tensors["pins"].shape[0], 3)),
+    )
+
+
+def _setup(ctx, inputs, output):
+    _, mean, _, _, model, max_iterations = inputs
+    ctx.save_for_backward(mean, *model)
+    ctx.max_iterations = max_iterations
+    ctx.mark_non_differentiable(*output[1:])
+
+
+def _backward(ctx, grad_vertices, _iterations, _error):
+    mean, *model = ctx.saved_tensors
+    grad_phi, grad_mean, grad_pins = torch.ops.warpgarment.poisson_solve_backward(
+        grad_vertices, mean, model, ctx.max_iterations
+    )
+    return grad_phi, grad_mean, grad_pins, None, [None] * len(model), None
+
+
+poisson_solve.register_autograd(_backward, setup_context=_setup)

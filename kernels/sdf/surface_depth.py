@@ -1,0 +1,233 @@
+r"""How deep garments are inside bodies: at vertices, and between them.
+
+A vertex of a garment keeps a distance from the body, but the body can still come through an edge or a face whose
+corners are all outside. Looked at are
+
+- the vertices,
+- the middles of edges and faces,
+- on every face, the point c nearest to the body vertex u that stands out of it most, and less than l:
+  |u - c| < l with n·(u - x) > 0, u of a body face that looks the same way. Whatever is pointed has a vertex at its tip.
+
+Those inside the body count; their depth is the distance to its surface. What can be left is one edge across another.
+
+| symbol | code | what |
+| --- | --- | --- |
+| x, n | `x, y, z`, `normal` | corners of a face [m], its normal |
+| u, c, l | `tip`, `foot`, `STANDS_OUT` | |
+| | `missing` | how much deeper the edges and faces at a vertex are than their corners [m] |
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.collision.body_contacts import closest_on_triangle
+from warpgarment.kernels.launch import as_argument, expect, torch_stream
+from warpgarment.kernels.operator import allocate
+
+from .bodies import BodyMeshes
+from .closest import Bodies, closest_on_body
+
+STANDS_OUT = wp.constant(0.01)
+"""l [m]. Of what stands out further, vertices that are lower down are found; a bare spike is missed."""
+
+
+class SurfaceDepth(NamedTuple):
+    """What `surface_depth` finds [m], float32, at least 0."""
+
+    vertices: torch.Tensor  # depth of each vertex, [V]
+    garments: torch.Tensor  # of each garment's deepest point, [B]
+    missing: torch.Tensor  # at each vertex, how much deeper its edges and faces are than their corners, [V]
+
+
+@wp.func
+def depth_at(bodies: Bodies, b: int, point: wp.vec3) -> float:
+    """How deep a point is inside a body, 0 outside."""
+    depth = wp.float32(0.0)
+    _face, sign, _weights, closest = closest_on_body(bodies, b, point, 0.0)
+    if sign < 0.0:
+        depth = wp.float32(wp.length(wp.vec3d(point) - closest))
+    return depth
+
+
+@wp.kernel(enable_backward=False)
+def feet_of_tips(
+    # Model:
+    bodies: Bodies,
+    faces: wp.array[wp.vec3i],
+    # In:
+    vertices: wp.array[wp.vec3],
+    body_of_vertex: wp.array[wp.int32],
+    # Out:
+    feet: wp.array[wp.vec3],
+):
+    """c of each face, NaN where no body vertex stands out. A kernel of its own: two kinds of queries do not fit in the
+    shared memory of a GPU."""
+    i = wp.tid()
+    feet[i] = wp.vec3(wp.nan)
+    b = body_of_vertex[faces[i][0]]
+    if b < 0 or b >= bodies.meshes.shape[0]:
+        return
+    x = vertices[faces[i][0]]
+    y = vertices[faces[i][1]]
+    z = vertices[faces[i][2]]
+    normal = wp.cross(y - x, z - x)
+    if not (wp.length(normal) > 0.0 and wp.isfinite(normal)):
+        return
+    room = wp.vec3(STANDS_OUT)
+    query = wp.mesh_query_aabb(bodies.meshes[b], wp.min(x, wp.min(y, z)) - room, wp.max(x, wp.max(y, z)) + room)
+    face = wp.int32(0)
+    most = wp.float32(0.0)
+    while wp.mesh_query_aabb_next(query, face):
+        corner = bodies.faces[face + bodies.face_offsets[b]]
+        first = bodies.vertices[corner[0]]
+        outward = wp.cross(bodies.vertices[corner[1]] - first, bodies.vertices[corner[2]] - first)
+        if wp.dot(outward, normal) > 0.0:
+            for k in range(3):
+                tip = bodies.vertices[corner[k]]
+                height = wp.dot(normal, tip - x)
+                if height > 0.0 and height < STANDS_OUT * wp.length(normal):
+                    foot = wp.vec3(closest_on_triangle(wp.vec3d(tip), wp.vec3d(x), wp.vec3d(y), wp.vec3d(z)))
+                    away = wp.length(tip - foot)
+                    if away > most and away < STANDS_OUT:
+                        most = away
+                        feet[i] = foot
+
+
+@wp.kernel(enable_backward=False)
+def depth_of_vertices(
+    # Model:
+    bodies: Bodies,
+    garment_of_vertex: wp.array[wp.int32],
+    # In:
+    vertices: wp.array[wp.vec3],
+    body_of_vertex: wp.array[wp.int32],
+    # Out:
+    depth: wp.array[wp.float32],
+    missing: wp.array[wp.float32],
+    deepest: wp.array[wp.float32],  # accumulated
+):
+    i = wp.tid()
+    depth[i] = 0.0
+    missing[i] = 0.0
+    b = body_of_vertex[i]
+    if b >= 0 and b < bodies.meshes.shape[0]:
+        depth[i] = depth_at(bodies, b, vertices[i])
+        wp.atomic_max(deepest, garment_of_vertex[i], depth[i])
+
+
+@wp.kernel(enable_backward=False)
+def depth_between_vertices(
+    # Model:
+    bodies: Bodies,
+    garment_of_vertex: wp.array[wp.int32],
+    edges: wp.array[wp.vec2i],
+    faces: wp.array[wp.vec3i],
+    # In:
+    vertices: wp.array[wp.vec3],
+    body_of_vertex: wp.array[wp.int32],
+    depth: wp.array[wp.float32],
+    feet: wp.array[wp.vec3],
+    # Out:
+    missing: wp.array[wp.float32],  # accumulated
+    deepest: wp.array[wp.float32],  # accumulated
+):
+    """Of one edge or one face."""
+    i = wp.tid()
+    corner = wp.vec3i()
+    is_face = i >= edges.shape[0]
+    if is_face:
+        corner = faces[i - edges.shape[0]]
+    else:
+        corner = wp.vec3i(edges[i][0], edges[i][1], edges[i][1])
+    b = body_of_vertex[corner[0]]
+    if b < 0 or b >= bodies.meshes.shape[0]:
+        return
+    x = vertices[corner[0]]
+    y = vertices[corner[1]]
+    z = vertices[corner[2]]
+    garment = garment_of_vertex[corner[0]]
+    worst = wp.float32(0.0)
+    if is_face:
+        worst = wp.max(depth_at(bodies, b, (x + y + z) / 3.0), depth_at(bodies, b, feet[i - edges.shape[0]]))
+    else:
+        worst = depth_at(bodies, b, 0.5 * (x + y))
+    more = worst - wp.max(depth[corner[0]], wp.max(depth[corner[1]], depth[corner[2]]))
+    if more > 0.0:
+        wp.atomic_max(deepest, garment, worst)
+        wp.atomic_max(missing, corner[0], more)
+        wp.atomic_max(missing, corner[1], more)
+        wp.atomic_max(missing, corner[2], more)
+
+
+def surface_depth(
+    vertices: torch.Tensor,
+    bodies: BodyMeshes,
+    body_of_vertex: torch.Tensor,
+    edges: torch.Tensor,
+    faces: torch.Tensor,
+    garment_of_vertex: torch.Tensor,
+    count: int,
+) -> SurfaceDepth:
+    """Depths of a packed batch of garments; without gradients.
+
+    Args:
+        vertices: Positions [m], float32 [V,3]; those that are not finite count as outside.
+        bodies: The bodies in the same frame.
+        body_of_vertex: Body of each vertex, int32 [V]; those on body -1 are in none.
+        edges: Vertex indices of every edge, int32 [E,2].
+        faces: Vertex indices, int32 [F,3].
+        garment_of_vertex: Owners, int32 [V].
+        count: Number of garments B.
+
+    Raises:
+        ValueError: Wrong shape or device.
+        TypeError: Wrong dtype.
+    """
+    device, size = vertices.device, len(vertices)
+    expect("vertices", vertices, (None, 3))
+    expect("edges", edges, (None, 2), torch.int32, device)
+    expect("faces", faces, (None, 3), torch.int32, device)
+    for name, tensor in (("body_of_vertex", body_of_vertex), ("garment_of_vertex", garment_of_vertex)):
+        expect(name, tensor, (size,), torch.int32, device)
+    depth, missing = allocate((2, size), torch.float32, device)
+    feet = allocate((len(faces), 3), torch.float32, device)
+    deepest = torch.zeros(count, dtype=torch.float32, device=device)
+    owners, points = as_argument(garment_of_vertex, wp.int32), as_argument(vertices.detach(), wp.vec3)
+    body = as_argument(body_of_vertex, wp.int32)
+    results = [as_argument(tensor, wp.float32) for tensor in (depth, missing, deepest)]
+    with torch_stream(device) as warp_device:
+        wp.launch(
+            feet_of_tips,
+            dim=len(faces),
+            inputs=[bodies.model, as_argument(faces, wp.vec3i), points, body],
+            outputs=[as_argument(feet, wp.vec3)],
+            device=warp_device,
+        )
+        wp.launch(
+            depth_of_vertices,
+            dim=size,
+            inputs=[bodies.model, owners, points, body],
+            outputs=results,
+            device=warp_device,
+        )
+        wp.launch(
+            depth_between_vertices,
+            dim=len(edges) + len(faces),
+            inputs=[
+                bodies.model,
+                owners,
+                as_argument(edges, wp.vec2i),
+                as_argument(faces, wp.vec3i),
+                points,
+                body,
+                results[0],
+                as_argument(feet, wp.vec3),
+            ],
+            outputs=results[1:],
+            device=warp_device,
+        )
+    return SurfaceDepth(depth, deepest, missing)
