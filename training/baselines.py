@@ -23,7 +23,8 @@ from trimesh.triangles import closest_point, points_to_barycentric
 
 from warpgarment.body import BodyMotion
 from warpgarment.garment import Garment
-from warpgarment.kernels.deformation.gradients import deformation_gradient, rotation
+from warpgarment.kernels.deformation.gradients import deformation_gradient
+from warpgarment.kernels.deformation.svd import rotation
 from warpgarment.kernels.mesh.laplacian import components
 
 NEIGHBOURS = 8

@@ -25,11 +25,8 @@ import torch
 
 from warpgarment.config import NetworkConfig
 from warpgarment.heading import rotation_about_up
-from warpgarment.kernels.deformation.gradients import (
-    deformation_gradient_from_inverse,
-    relative_deformation_gradient,
-    singular_values,
-)
+from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
+from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
 from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.patches import Patches, PatchLayout, patch_layout

@@ -33,11 +33,8 @@ from torch import nn
 
 from warpgarment.batch import PaddedView
 from warpgarment.heading import canonical_frame
-from warpgarment.kernels.deformation.gradients import (
-    deformation_gradient_from_inverse,
-    relative_deformation_gradient,
-    singular_values,
-)
+from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
+from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.face import LAYOUT
 from warpgarment.network import ManifoldAwareTransformer, NetworkOutput, rotate_output
 from warpgarment.parametrisation import Step, compose, context, targets

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import torch
 
-from warpgarment.kernels.deformation.gradients import face_centroids, replace_singular_values, segment_mean
+from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
+from warpgarment.kernels.deformation.svd import replace_singular_values
 from warpgarment.kernels.features.face import LAYOUT, body_interaction, face_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
