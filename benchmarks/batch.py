@@ -12,11 +12,11 @@ import torch
 from benchmarks.measure import NO_GPU, Row, aimed_time, figures, interleaved
 from benchmarks.networks import Named
 from benchmarks.scenes import Dressed, dressed
-from warpgarment import memory
 from warpgarment.errors import NotEnoughMemory
-from warpgarment.garment import Garment
-from warpgarment.simulator import Simulator
-from warpgarment.state import SimulationState
+from warpgarment.objects.garment import Garment
+from warpgarment.sim import memory
+from warpgarment.sim.simulator import Simulator
+from warpgarment.sim.state import SimulationState
 
 CPU_BATCH = (1, 2, 4, 8, 16)
 GPU_BATCH = (1, 4, 16, 64, 256, 1024, 4096)
@@ -124,7 +124,7 @@ def _stages(size: int, simulator: Simulator) -> Iterator[Row]:
     frames = 4
     # processor time on a CPU, as everywhere here
     clock = time.process_time if simulator.device.type == "cpu" else time.perf_counter
-    with mock.patch("warpgarment.timing.time.perf_counter", clock):
+    with mock.patch("warpgarment.sim.timing.time.perf_counter", clock):
         for _ in range(frames):
             rolling()
     simulator.timings.synchronise = False

@@ -13,10 +13,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.batch import Rolling, scenes_of
 from benchmarks.measure import NO_GPU, Row, aimed
 from benchmarks.networks import Named
-from warpgarment.frame import advance
-from warpgarment.frame_graph import WARM_UP
 from warpgarment.kernels.linear import conjugate_gradients
-from warpgarment.simulator import Simulator
+from warpgarment.sim.frame import advance
+from warpgarment.sim.graph import WARM_UP
+from warpgarment.sim.simulator import Simulator
 
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero"}  # the host waits for these
 VIEWS = {"view", "unsqueeze", "expand", "slice", "select", "t", "transpose", "split", "split_with_sizes", "alias"}

@@ -13,14 +13,14 @@ import torch
 
 from benchmarks.measure import Call, Row, aimed, aimed_time, compared
 from benchmarks.scenes import remeshed
-from warpgarment.attention import ManifoldAwareAttention, geodesic_weights
-from warpgarment.batch import PackedGarments, padded_views
-from warpgarment.config import NetworkConfig
-from warpgarment.garment import KEPT, Garment
+from warpgarment.geometry.pooled_geodesics import CENTRES
 from warpgarment.kernels.mesh.shortest_paths import usable_cores
-from warpgarment.patches import PatchLayout
-from warpgarment.pooled_geodesics import CENTRES
-from warpgarment.pooled_weights import dense_weights, pooled_weights
+from warpgarment.nn.attention import ManifoldAwareAttention, geodesic_weights
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.layout import dense_weights, pooled_weights
+from warpgarment.nn.patches.layout import PatchLayout
+from warpgarment.objects.garment import KEPT, Garment
+from warpgarment.objects.pack import PackedGarments, padded_views
 
 from . import exact
 

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import torch
 
-from warpgarment import checkpoint
-from warpgarment.config import NetworkConfig
 from warpgarment.errors import CheckpointError
-from warpgarment.network import GarmentNetwork, build_network
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import build_network
+from warpgarment.nn.network import GarmentNetwork
 
 SHAPES = {"small": NetworkConfig.small, "fast": NetworkConfig.fast, "base": NetworkConfig.base}
 DEFAULT = ("small", "fast")

@@ -25,12 +25,12 @@ import torch
 from benchmarks.batch import scenes_of
 from benchmarks.measure import NO_GPU, Row, figures, interleaved
 from benchmarks.networks import Named
-from warpgarment.config import NetworkConfig
-from warpgarment.garment import POOLED
+from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
 from warpgarment.kernels.features.face import FEATURES
-from warpgarment.patches import SHARES, PatchLayout
-from warpgarment.pooled_geodesics import CENTRES, NEAR
-from warpgarment.simulator import Simulator
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.patches.layout import SHARES, PatchLayout
+from warpgarment.objects.garment import POOLED
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.flops import forward_flops
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}

@@ -12,12 +12,12 @@ import torch
 
 from benchmarks.measure import Call, Row, aimed, aimed_time, compared, tensor
 from benchmarks.scenes import Dressed
-from warpgarment.garment import Garment
 from warpgarment.kernels import deformation
 from warpgarment.kernels.collision.body_contacts import contacts
 from warpgarment.kernels.collision.solver import TOLERANCE, CollisionSolver
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.objects.garment import Garment
 
 NOT_INSTALLED = "not installed"
 EPSILON = 0.004  # metres kept from the body

@@ -29,7 +29,7 @@ from benchmarks.measure import RESULTS, Row, figures, interleaved, machine
 from benchmarks.networks import Named
 from benchmarks.scenes import dressed
 from warpgarment.io.atomic import atomic_files
-from warpgarment.simulator import Simulator
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, TeacherError, make_teacher
 
 WORLDS = {"cpu": (1, 4), "cuda": (1, 4, 16, 64, 256, 1024)}

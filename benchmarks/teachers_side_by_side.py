@@ -25,13 +25,14 @@ import numpy as np
 import torch
 
 from benchmarks.measure import machine
-from warpgarment import demo, draw
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
+from warpgarment import demo
 from warpgarment.metrics import layer_collision
-from warpgarment.motion import GarmentMotion
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
+from warpgarment.objects.motion import GarmentMotion
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, make_teacher
 from warpgarment.training.teachers.checks import hanging_strip, pendulum, rest_on_sphere
+from warpgarment.view import draw
 
 RESULTS = Path(__file__).parent / "results"
 WIDER = 0.020  # gap between the T-shirt and the one over it [m]

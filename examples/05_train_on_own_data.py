@@ -14,7 +14,8 @@ import tyro
 
 import warpgarment as wg
 from warpgarment.training.dataset import write_sequence
-from warpgarment.training.train import TrainConfig, train
+from warpgarment.training.train import train
+from warpgarment.training.train_config import TrainConfig
 
 
 def write_own_data(folder: Path, frames: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import meshes
 import numpy as np
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 from warpgarment.training.materials import Material
 from warpgarment.training.teachers import Cloth, ClothScene
 from warpgarment.training.teachers.checks import flat_sheet, hanging_sheet

@@ -7,8 +7,9 @@ from pathlib import Path
 import synthetic_sequences
 import torch
 
-from warpgarment import checkpoint
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.evaluate import EvaluateConfig
 from warpgarment.training.tables.options import TableOptions
 

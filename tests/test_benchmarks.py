@@ -13,9 +13,10 @@ from benchmarks import exact, manifold, roofline
 from benchmarks.__main__ import SECONDS, main
 from benchmarks.measure import aimed_time, compared, interleaved
 from benchmarks.networks import named
-from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, build_network
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
 
 EXPECTED = {  # part: what its rows must be about, and references beside them
     "geodesics": ({"geodesics of all pairs of faces", "geodesics, off the exact ones"}, set()),

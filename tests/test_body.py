@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 import warpgarment as wg
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.geometry.skinning import linear_blend_skinning
 
 
 def body(frames=4):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_geodesics import skirt
 
-from warpgarment import cache
-from warpgarment.garment import Garment
+from warpgarment.io import cache
+from warpgarment.objects.garment import Garment
 
 EXPECTED = {"a": ("float32", (3, None))}
 
@@ -115,7 +115,7 @@ def test_a_folder_that_cannot_be_written_to_is_no_error(folder, monkeypatch):
 
 def test_garments_keep_their_distances_on_disk(folder, monkeypatch):
     """Distances would be searched for again at each start, or a garment given those of another."""
-    monkeypatch.setattr("warpgarment.garment.KEPT", 50)
+    monkeypatch.setattr("warpgarment.objects.garment.KEPT", 50)
     vertices, faces = skirt(12, 5, None)
     first, again, moved = Garment(vertices, faces), Garment(vertices, faces), Garment(vertices * 2, faces)
     distances, pooled = first.geodesics, first.pooled_geodesics

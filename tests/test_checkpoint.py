@@ -12,9 +12,11 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
-from warpgarment.network import STATISTICS, ManifoldAwareTransformer, NetworkConfig
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.network import STATISTICS
 
 
 @pytest.fixture

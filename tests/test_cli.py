@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from warpgarment import checkpoint, cli
-from warpgarment.body import BodyMotion
-from warpgarment.motion import GarmentMotion
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment import cli
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.motion import GarmentMotion
 
 
 @pytest.fixture
@@ -115,7 +117,7 @@ def test_convert_keeps_positions(scene) -> None:
 
 def test_an_animation_becomes_part_of_a_data_set(scene, capsys) -> None:
     """Own simulations in other units cannot be trained on, or become a hundred times too large. 16-bit: 1e-5 m."""
-    from warpgarment.garment import Garment
+    from warpgarment.objects.garment import Garment
     from warpgarment.training.dataset import Sequence
 
     rest = Garment.load(scene / "band.obj", unit="cm")

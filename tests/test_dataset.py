@@ -13,8 +13,8 @@ from data_bodies import rest_body
 
 from warpgarment import demo
 from warpgarment.errors import MeshError
-from warpgarment.garment import Garment
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.geometry.skinning import linear_blend_skinning
+from warpgarment.objects.garment import Garment
 from warpgarment.training import dataset
 from warpgarment.training.quality import Limits, QualityGate
 

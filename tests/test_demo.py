@@ -7,12 +7,12 @@ import pytest
 from pxr import Usd, UsdGeom
 
 from warpgarment import demo
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
 from warpgarment.metrics import mean_vertex_error
-from warpgarment.report import table
-from warpgarment.simulator import Simulator
+from warpgarment.objects.body import BodyMotion
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.baselines import skinned
+from warpgarment.view.report import table
 
 
 @pytest.fixture(scope="module")

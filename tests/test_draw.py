@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpgarment import draw
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
 from warpgarment.kernels.render import raster, shading
-from warpgarment.motion import GarmentMotion
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.motion import GarmentMotion
+from warpgarment.view import draw
 
 SIZE = 48
 

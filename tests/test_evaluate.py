@@ -11,14 +11,16 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from warpgarment import checkpoint
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.training import evaluate
 from warpgarment.training.baselines import kabsch, rigid, skinned
 from warpgarment.training.dataset import Sequence
-from warpgarment.training.evaluate import EvaluateConfig, NoTestData, OptionMissing
+from warpgarment.training.evaluate import EvaluateConfig, NoTestData
+from warpgarment.training.tables.errors import OptionMissing
 
 
 def moving_body(frames: int, move) -> tuple[BodyMotion, Garment]:

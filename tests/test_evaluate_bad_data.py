@@ -9,8 +9,9 @@ import pytest
 import synthetic_sequences
 import torch
 
-from warpgarment import checkpoint
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.evaluate import EvaluateConfig, NoTestData, evaluate
 from warpgarment.training.tables import groups, runs
 from warpgarment.training.tables.options import TableOptions

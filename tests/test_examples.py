@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgarment.motion import GarmentMotion
+from warpgarment.objects.motion import GarmentMotion
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

@@ -15,11 +15,11 @@ import torch
 from test_simulator import Failing, body, network, outfit, simulator, skirt, still, tube, walk
 
 from benchmarks.frames import FrameCounts, Operators
-from warpgarment import frame_graph
-from warpgarment import simulator as simulator_module
-from warpgarment.frame import Recording
-from warpgarment.garment import Garment
-from warpgarment.simulator import Simulator
+from warpgarment.objects.garment import Garment
+from warpgarment.sim import graph
+from warpgarment.sim import simulator as simulator_module
+from warpgarment.sim.frame import Recording
+from warpgarment.sim.simulator import Simulator
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -129,7 +129,7 @@ def sim_with(request, monkeypatch):
     def make(device, record=again):
         sim = Simulator(network(), device)
         if device == "cpu":
-            graphed = frame_graph.GraphedFrames
+            graphed = graph.GraphedFrames
             monkeypatch.setattr(simulator_module, "GraphedFrames", lambda s, a: graphed(s, a, record))
             sim.graph = True
         return sim

@@ -11,7 +11,7 @@ import pytest
 from data_bodies import rest_body
 from scipy.spatial import cKDTree
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 from warpgarment.training.garment_checks import faults
 from warpgarment.training.garments import CATEGORIES, Pattern, make_garment, needs_forearms, sampled_pattern
 from warpgarment.training.mesh_cutting import (

@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warpgarment.training.dataset import DatasetMismatch, Sequence, list_sequences, read_manifest
+from warpgarment.training.dataset import Sequence, list_sequences, read_manifest
 from warpgarment.training.generate import generate, make_sequences, numbers_to_make
 from warpgarment.training.recipes import GenerateConfig
+from warpgarment.training.set_manifest import DatasetMismatch
 from warpgarment.training.verify import verify
 
 

@@ -7,7 +7,7 @@ from pygeodesic.geodesic import PyGeodesicAlgorithmExact
 from scipy.spatial import Delaunay
 
 import warpgarment as wg
-from warpgarment.geodesics import face_geodesics, local_geodesics
+from warpgarment.geometry.geodesics import face_geodesics, local_geodesics
 
 
 def sheet(columns, rows, wrap=False):
@@ -142,7 +142,7 @@ def test_blocks_of_local_distances_make_no_difference(monkeypatch):
     """A block's surroundings would be too small for the shortest paths of its faces."""
     vertices, faces = skirt(24, 4, None, 0.05)
     whole = local_geodesics(vertices, faces, 0.3)
-    monkeypatch.setattr("warpgarment.geodesics.BLOCK", 7)
+    monkeypatch.setattr("warpgarment.geometry.geodesics.BLOCK", 7)
     np.testing.assert_allclose(local_geodesics(vertices, faces, 0.3).toarray(), whole.toarray(), rtol=1e-6)
 
 
@@ -152,7 +152,7 @@ def test_local_distances_refuse_a_bad_radius_and_too_many_pairs(monkeypatch):
     for radius in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="radius must be positive"):
             local_geodesics(vertices, faces, radius)
-    monkeypatch.setattr("warpgarment.geodesics.MEMORY_BUDGET", 4000)
+    monkeypatch.setattr("warpgarment.geometry.geodesics.MEMORY_BUDGET", 4000)
     with pytest.raises(wg.MeshError, match="lower the radius"):
         local_geodesics(vertices, faces, 10.0)
 
@@ -212,7 +212,7 @@ def test_bad_meshes_and_too_large_ones_are_refused(monkeypatch):
         face_geodesics(vertices, np.r_[faces, [[0, 1, 2]]])
     with pytest.raises(wg.MeshError, match="do not exist"):
         face_geodesics(vertices, faces + 20)
-    monkeypatch.setattr("warpgarment.geodesics.MEMORY_BUDGET", 4000)
+    monkeypatch.setattr("warpgarment.geometry.geodesics.MEMORY_BUDGET", 4000)
     with pytest.raises(wg.MeshError, match="MEMORY_BUDGET"):
         face_geodesics(vertices, faces)
 

@@ -10,10 +10,11 @@ import types
 import pytest
 import torch
 
-from warpgarment import checkpoint, hub
 from warpgarment.errors import CheckpointError, MissingExtra
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
-from warpgarment.simulator import Simulator
+from warpgarment.nn import checkpoint, hub
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.sim.simulator import Simulator
 
 
 def network(seed: int = 0) -> ManifoldAwareTransformer:

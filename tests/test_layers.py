@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from warpgarment.garment import Garment
 from warpgarment.metrics import layer_collision
+from warpgarment.objects.garment import Garment
 from warpgarment.training.layers import LayerFigures, Sheet
 
 

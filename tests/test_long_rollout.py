@@ -11,10 +11,11 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from warpgarment import checkpoint
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.evaluate import EvaluateConfig, evaluate
 from warpgarment.training.long_rollout import Limits, extended, figures, judged, there_and_back, walk
@@ -207,7 +208,7 @@ def test_long_rollouts_of_sequences(network, tmp_path):
     shown = np.isfinite(result["rows"][0]["curves"]["mean_to_recording_m"])
     _, forward = there_and_back(16, 34)
     np.testing.assert_array_equal(shown, forward[10:])
-    from warpgarment.simulator import Simulator
+    from warpgarment.sim.simulator import Simulator
     from warpgarment.training.rollouts import predict
 
     sequence = Sequence.load(folder)

@@ -10,15 +10,16 @@ import torch
 from scipy.spatial import cKDTree
 from test_simulator import network, skirt, tube, walk
 
-from warpgarment import memory
 from warpgarment.errors import NotEnoughMemory
-from warpgarment.garment import Garment
+from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
 from warpgarment.kernels.collision.operator import _parts as parts
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.poisson.solver import PoissonSolver
-from warpgarment.network import NetworkConfig, build_network
-from warpgarment.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
-from warpgarment.simulator import Simulator
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import build_network
+from warpgarment.objects.garment import Garment
+from warpgarment.sim import memory
+from warpgarment.sim.simulator import Simulator
 
 FACTOR = 1.5
 

@@ -12,10 +12,11 @@ import pytest
 import synthetic_sequences
 import torch
 
-from warpgarment import checkpoint
-from warpgarment.body import BodyMotion
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
-from warpgarment.simulator import Simulator
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.objects.body import BodyMotion
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training import evaluate, model_card, model_card_pictures
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.model_card import CardError, ModelCardConfig, chosen, largest, read_log, write_card

@@ -8,19 +8,12 @@ from data_bodies import rest_body, write_amass, write_bvh
 from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.training import skeleton
-from warpgarment.training.motions import (
-    Clip,
-    clip_frames,
-    jumps,
-    list_clips,
-    read_amass,
-    read_bvh,
-    read_clip,
-    resampled,
-    retarget,
-)
+from warpgarment.training.amass import read_amass
+from warpgarment.training.bvh import read_bvh
+from warpgarment.training.clips import Clip, resampled
+from warpgarment.training.motions import clip_frames, jumps, list_clips, read_clip, retarget
 from warpgarment.training.procedural import KINDS, procedural
 
 ARM = [("Hips", None, (0.0, 0.0, 0.0)), ("Spine", "Hips", (0.0, 2.0, 0.0)), ("Head", "Spine", (0.0, 3.0, 0.0))]

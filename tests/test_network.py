@@ -7,13 +7,15 @@ import pytest
 import scipy.special
 import torch
 
-from warpgarment import heading
-from warpgarment.attention import EncoderLayer, ManifoldAwareAttention
 from warpgarment.kernels.deformation.gradients import face_centroids, inverse_rest_frames, segment_mean
 from warpgarment.kernels.features.face import FEATURES, body_interaction, face_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.network import STATISTICS, ManifoldAwareTransformer, NetworkConfig, geodesic_weights, rotate_output
-from warpgarment.parametrisation import NetworkOutput
+from warpgarment.nn import heading
+from warpgarment.nn.attention import EncoderLayer, ManifoldAwareAttention, geodesic_weights
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.network import STATISTICS, rotate_output
+from warpgarment.nn.parametrisation import NetworkOutput
 
 TINY = {"embedding": 24, "layers": 2, "feed_forward": 32, "heads": 3, "manifold_heads": 1, "history": 3}
 

@@ -9,12 +9,12 @@ import pytest
 import torch
 from test_simulator import body, network, outfit, skirt, walk
 
-from warpgarment.batch import PackedBodies
-from warpgarment.history import History
-from warpgarment.patch_network import PatchTransformer
-from warpgarment.scene import Scene
-from warpgarment.simulator import Simulator
-from warpgarment.timing import Timings
+from warpgarment.nn.patches.network import PatchTransformer
+from warpgarment.objects.pack import PackedBodies
+from warpgarment.sim.history import History
+from warpgarment.sim.scene import Scene
+from warpgarment.sim.simulator import Simulator
+from warpgarment.sim.timing import Timings
 
 DEVICE = "cuda"
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

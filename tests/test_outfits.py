@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from data_bodies import rest_body
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 from warpgarment.training import outfits
 from warpgarment.training.garments import CATEGORIES
 from warpgarment.training.outfits import (

@@ -9,7 +9,7 @@ import scipy.spatial.transform
 import torch
 
 from warpgarment.kernels.features.face import FEATURES, LAYOUT
-from warpgarment.parametrisation import NetworkOutput, Step, component_mean, compose, context, targets
+from warpgarment.nn.parametrisation import NetworkOutput, Step, component_mean, compose, context, targets
 
 COMPONENT = torch.tensor([[0, 0, 1, 1, 1, 0], [0, 1, 2, 2, 0, 1]])
 

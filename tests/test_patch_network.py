@@ -15,20 +15,16 @@ from test_simulator import skirt as worn_skirt
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
-from warpgarment.garment import Garment
 from warpgarment.kernels.features.face import FEATURES
-from warpgarment.network import (
-    STATISTICS,
-    ManifoldAwareTransformer,
-    NetworkConfig,
-    PatchTransformer,
-    build_network,
-    geodesic_weights,
-    rotate_output,
-)
-from warpgarment.patches import PatchLayout, garment_patches, patch_layout
+from warpgarment.nn import checkpoint
+from warpgarment.nn.attention import geodesic_weights
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
+from warpgarment.nn.network import STATISTICS, rotate_output
+from warpgarment.nn.patches.layout import PatchLayout, garment_patches, patch_layout
+from warpgarment.nn.patches.network import PatchTransformer
+from warpgarment.objects.garment import Garment
 from warpgarment.training.flops import forward_flops
 
 TINY = {

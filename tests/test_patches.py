@@ -7,8 +7,8 @@ import pytest
 import torch
 from meshes import irregular_grid, joined, moved, skirt, two_components
 
-from warpgarment.garment import Garment
-from warpgarment.patches import SHARES, edge_neighbours, garment_patches, patch_layout
+from warpgarment.nn.patches.layout import SHARES, edge_neighbours, garment_patches, patch_layout
+from warpgarment.objects.garment import Garment
 
 SPACING = 0.1
 

@@ -9,8 +9,8 @@ import pytest
 import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
-from warpgarment.garment import Garment
-from warpgarment.pins import mean_response
+from warpgarment.objects.garment import Garment
+from warpgarment.sim.pins import mean_response
 
 
 def test_moving_the_mean_of_a_pinned_garment_is_the_constrained_minimiser():

@@ -7,13 +7,13 @@ from scipy.sparse import csr_matrix
 from scipy.sparse import random as random_matrix
 from test_geodesics import MESHES, exact_distances, flat, skirt
 
-from warpgarment.attention import ManifoldAwareAttention
-from warpgarment.batch import PackedGarments, padded_views
-from warpgarment.garment import Garment
-from warpgarment.geodesics import face_geodesics
-from warpgarment.network import NetworkConfig, geodesic_weights
-from warpgarment.pooled_geodesics import NEAR, PooledGeodesics, _furthest_points, pooled_geodesics
-from warpgarment.pooled_weights import Bags, bag_product, dense_weights, pooled_weights
+from warpgarment.geometry.geodesics import face_geodesics
+from warpgarment.geometry.pooled_geodesics import NEAR, PooledGeodesics, _furthest_points, pooled_geodesics
+from warpgarment.nn.attention import ManifoldAwareAttention, geodesic_weights
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.layout import Bags, bag_product, dense_weights, pooled_weights
+from warpgarment.objects.garment import Garment
+from warpgarment.objects.pack import PackedGarments, padded_views
 
 CPU = torch.device("cpu")
 
@@ -137,7 +137,7 @@ def test_every_row_of_the_interpolation_sums_to_one_and_pieces_stay_apart():
 def test_views_pool_large_garments_and_leave_small_ones_as_they_are(monkeypatch):
     """A large garment would still make a matrix of F x F, or a small one lose its exact weights; and splits of a pooled
     garment would meet the wrong faces."""
-    monkeypatch.setattr("warpgarment.garment.POOLED", 300)
+    monkeypatch.setattr("warpgarment.objects.garment.POOLED", 300)
     large, small = Garment(*skirt(24, 8, None, 0.03)), Garment(*skirt(16, 6, None))
     packed = PackedGarments.pack([large, small, large], CPU)
     config = NetworkConfig.small()

@@ -10,8 +10,8 @@ import pytest
 from reader_files import QUADS, STRIP, TRIANGLES, mat_file, moving, write_obj, write_point_cache
 from scipy.spatial.transform import Rotation
 
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
+from warpgarment.objects.body import BodyMotion
 from warpgarment.training.readers import detect, read_cloth3d, read_pc16, read_recording
 
 FRAMES = 5

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from reader_files import STRIP, TRIANGLES, moving
 
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
-from warpgarment.garment import Garment
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.training.materials import Material
 from warpgarment.training.readers import PickleRefused, detect, read_dlayers, read_recording
 from warpgarment.training.readers.blender_cloth import blender_material, mass_ratio, wind_speed

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from reader_files import QUADS, STRIP, TRIANGLES, moving, write_obj, write_point_cache, write_usda
 
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
-from warpgarment.garment import Garment
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.training.dataset import Sequence, list_sequences
 from warpgarment.training.materials import Material
 from warpgarment.training.readers import (

@@ -11,7 +11,7 @@ from reader_files import STRIP, TRIANGLES, moving, write_obj
 from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
-from warpgarment.motion import GarmentMotion
+from warpgarment.objects.motion import GarmentMotion
 from warpgarment.training.readers import PickleRefused, convert_vto, detect, read_recording, read_vto
 
 FRAMES = 4

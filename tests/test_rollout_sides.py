@@ -6,10 +6,10 @@ import pytest
 import torch
 from test_simulator import network
 
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
-from warpgarment.scene import Scene
-from warpgarment.simulator import Simulator
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
+from warpgarment.sim.scene import Scene
+from warpgarment.sim.simulator import Simulator
 
 
 @pytest.mark.parametrize("remembers", [True, False])

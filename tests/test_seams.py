@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from data_bodies import rest_body
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 from warpgarment.training.garments import CATEGORIES, Pattern, make_garment
 from warpgarment.training.mesh_cutting import boundary_loops
 from warpgarment.training.seams import Seam, Seams, cut_seams, parted, sampled_seams

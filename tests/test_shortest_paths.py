@@ -6,7 +6,7 @@ from reference.shortest_paths import distances
 from scipy.sparse import coo_matrix
 from test_geodesics import flat, irregular, skirt
 
-from warpgarment.geodesics import checked_mesh, face_geodesics, local_geodesics, surface_graph
+from warpgarment.geometry.geodesics import checked_mesh, face_geodesics, local_geodesics, surface_graph
 from warpgarment.kernels.mesh import shortest_paths
 from warpgarment.kernels.mesh.shortest_paths import Paths
 
@@ -84,7 +84,7 @@ def test_sources_threads_and_blocks_change_no_bit(monkeypatch):
     np.testing.assert_array_equal(face_geodesics(vertices, faces), once)
     local = local_geodesics(vertices, faces, 0.4).toarray()
     np.testing.assert_array_equal(local, np.where(once <= 0.4, once, 0.0))
-    monkeypatch.setattr("warpgarment.geodesics.BLOCK", 50)
+    monkeypatch.setattr("warpgarment.geometry.geodesics.BLOCK", 50)
     monkeypatch.setattr(shortest_paths, "LANDMARKS", 1)
     np.testing.assert_array_equal(local_geodesics(vertices, faces, 0.4).toarray(), local)
 

@@ -13,15 +13,16 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from warpgarment.batch import PackedGarments, padded_views
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
-from warpgarment.garment import Garment
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
-from warpgarment.pins import BodyPins, barycentric_coordinates
-from warpgarment.simulator import Simulator
-from warpgarment.status import Verdict
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
+from warpgarment.objects.pack import PackedGarments, padded_views
+from warpgarment.objects.status import Verdict
+from warpgarment.sim.pins import BodyPins, barycentric_coordinates
+from warpgarment.sim.simulator import Simulator
 
 TINY = {"embedding": 16, "layers": 1, "feed_forward": 16, "heads": 2, "manifold_heads": 1, "history": 3, "dropout": 0.0}
 
@@ -465,7 +466,7 @@ def test_pretrained_networks_are_the_saved_ones(tmp_path):
 
 def test_coarse_garments_keep_more_distance():
     """A body would show through between the vertices of coarse cloth. A fifth of the mean edge, at least 4 mm."""
-    from warpgarment.clearance import clearance
+    from warpgarment.objects.clearance import clearance
 
     vertices, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]]), np.array([[0, 1, 2]])
     mean = (2.0 + np.sqrt(2.0)) / 3.0

@@ -9,13 +9,13 @@ import trimesh
 from poison import poison_outputs
 from test_simulator import network
 
-from warpgarment import scene
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.surface_depth import surface_depth
-from warpgarment.simulator import Simulator
-from warpgarment.surface import AMPLE, distance_to_keep
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
+from warpgarment.sim import scene
+from warpgarment.sim.simulator import Simulator
+from warpgarment.sim.surface import AMPLE, distance_to_keep
 
 LATTICE = np.array([(a, b, 10 - a - b) for a in range(11) for b in range(11 - a)]) / 10.0
 BALL = meshes.icosphere(3, radius=0.25)

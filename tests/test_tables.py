@@ -15,9 +15,10 @@ import table_scenes
 import trimesh
 from table_scenes import table_config
 
-from warpgarment import checkpoint, cli
-from warpgarment.garment import Garment
-from warpgarment.simulator import Simulator
+from warpgarment import cli
+from warpgarment.nn import checkpoint
+from warpgarment.objects.garment import Garment
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.dataset import Sequence, list_sequences
 from warpgarment.training.evaluate import EvaluateConfig, evaluate
 from warpgarment.training.tables import figure7, meshing, protocol, report

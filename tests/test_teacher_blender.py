@@ -15,8 +15,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from warpgarment.garment import Garment
 from warpgarment.io.pc2 import read_pc2
+from warpgarment.objects.garment import Garment
 from warpgarment.training.materials import Material, to_blender
 from warpgarment.training.teachers import Cloth, ClothScene, TeacherError, make_teacher
 from warpgarment.training.teachers import blender_environment as environment

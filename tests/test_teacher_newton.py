@@ -12,7 +12,7 @@ import warp as wp
 from cloth_scenes import BALL, flag, on_ball, sheet, still, stretch
 from scipy.spatial.transform import Rotation
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 from warpgarment.training.teachers import ClothScene, TeacherError, make_teacher
 from warpgarment.training.teachers._newton_model import Worlds
 from warpgarment.training.teachers._scenes import MovingFrame

@@ -14,7 +14,7 @@ import synthetic_sequences
 import torch
 from training_runs import SHAPE, config_for, entries_of, losses_of
 
-from warpgarment import checkpoint
+from warpgarment.nn import checkpoint
 from warpgarment.training import train
 from warpgarment.training.objective import Objective
 from warpgarment.training.pushforward import Pool, PushforwardConfig

@@ -10,7 +10,7 @@ import pytest
 import synthetic_sequences
 from training_runs import config_for, losses_of
 
-from warpgarment.network import NetworkConfig
+from warpgarment.nn.config import NetworkConfig
 from warpgarment.training import interactions, train
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.distributed import Group

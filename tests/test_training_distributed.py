@@ -11,7 +11,7 @@ import pytest
 import synthetic_sequences
 from training_runs import SHAPE, config_for, losses_of
 
-from warpgarment import checkpoint
+from warpgarment.nn import checkpoint
 from warpgarment.training import train
 from warpgarment.training.distributed import FRESH, Group, GroupError
 from warpgarment.training.noise import NoiseConfig

@@ -10,16 +10,20 @@ import synthetic_sequences
 import torch
 from training_runs import config_for, losses_of
 
-from warpgarment import checkpoint
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, PatchTransformer
-from warpgarment.parametrisation import NetworkOutput
-from warpgarment.patches import garment_patches, patch_layout
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.parametrisation import NetworkOutput
+from warpgarment.nn.patches.layout import garment_patches, patch_layout
+from warpgarment.nn.patches.network import PatchTransformer
 from warpgarment.training import interactions, train
+from warpgarment.training.augmentation import Augmentation
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.losses import LossConfig, loss
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.pushforward import Pool
-from warpgarment.training.samples import Augmentation, SampleBuilder, SequenceData
+from warpgarment.training.samples import SampleBuilder
+from warpgarment.training.sequence_data import SequenceData
 from warpgarment.training.unroll import UnrollConfig
 
 SHAPE = (

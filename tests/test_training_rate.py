@@ -8,7 +8,8 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from warpgarment.kernels.features.face import FEATURES
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.flops import forward_flops, peak_of, step_flops
 from warpgarment.training.rate import Rate, spelt
 

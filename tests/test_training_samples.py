@@ -13,19 +13,18 @@ import torch
 from warpgarment.kernels.deformation.gradients import deformation_gradient
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, body_interaction, face_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.network import (
-    ManifoldAwareTransformer,
-    NetworkConfig,
-    NormalisedOutput,
-    geodesic_weights,
-    rotate_output,
-)
-from warpgarment.parametrisation import NetworkOutput, Step, context, targets
+from warpgarment.nn.attention import geodesic_weights
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.network import NormalisedOutput, rotate_output
+from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.training import interactions
+from warpgarment.training.augmentation import Augmentation, mirror
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.losses import LossConfig, loss
 from warpgarment.training.noise import NoiseBasis, NoiseConfig
-from warpgarment.training.samples import Augmentation, SampleBuilder, SequenceData, mirror
+from warpgarment.training.samples import SampleBuilder
+from warpgarment.training.sequence_data import SequenceData
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.1, geodesic_radius=0.2)
 QUIET = NoiseConfig(position=0.0, offset=0.0)
@@ -177,7 +176,7 @@ def test_mirror_commutes_with_features(loaded):
 
 def test_joint_yaw_turns_the_sample(loaded):
     """World and rest turned by different angles: turning a sample is not turning its vectors. 1e-4: float32."""
-    from warpgarment.heading import rotation_about_up
+    from warpgarment.nn.heading import rotation_about_up
 
     plain = SampleBuilder([loaded], SMALL, QUIET, PLAIN).build([(0, 11)], 30, np.random.default_rng(7))
     builder = SampleBuilder([loaded], SMALL, QUIET, Augmentation(mirror=0.0, yaw=20.0))
@@ -303,7 +302,7 @@ def test_large_garments_train_without_all_pairs(data, tmp_path, monkeypatch):
 
     Against P exp(-(D_c s/r)^p) P^T in float64, for a garment made s times as large; 1e-5: float32.
     """
-    monkeypatch.setattr("warpgarment.garment.POOLED", 10)
+    monkeypatch.setattr("warpgarment.objects.garment.POOLED", 10)
     folder = data / "train_0"
     sequence = SequenceData(Sequence.load(folder), folder, tmp_path, SMALL, torch.device("cpu"))
     assert not list(tmp_path.rglob("geodesics.npy"))

@@ -11,10 +11,12 @@ import synthetic_sequences
 import torch
 from training_runs import config_for, entries_of, losses_of
 
-from warpgarment import checkpoint, differentiable
 from warpgarment.metrics import mean_vertex_error
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
-from warpgarment.simulator import Simulator
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.sim import differentiable
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training import interactions, train, unroll
 from warpgarment.training.augmentation import Augmentation
 from warpgarment.training.dataset import Sequence

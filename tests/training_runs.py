@@ -7,7 +7,7 @@ from pathlib import Path
 
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.pushforward import PushforwardConfig
-from warpgarment.training.train import TrainConfig
+from warpgarment.training.train_config import TrainConfig
 
 SHAPE = ("embedding=16", "layers=1", "feed_forward=16", "heads=2", "geodesic_radius=0.2")
 

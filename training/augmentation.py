@@ -22,7 +22,7 @@ from functools import lru_cache
 import torch
 
 from warpgarment.kernels.features.face import FEATURES, LAYOUT
-from warpgarment.parametrisation import NetworkOutput
+from warpgarment.nn.parametrisation import NetworkOutput
 
 LARGEST_SCALE = 0.1
 

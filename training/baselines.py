@@ -21,11 +21,11 @@ import torch
 from scipy.spatial import cKDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
 from warpgarment.kernels.deformation.gradients import deformation_gradient
 from warpgarment.kernels.deformation.svd import rotation
 from warpgarment.kernels.mesh.laplacian import components
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 
 NEIGHBOURS = 8
 SMOOTHING = 0.03  # metres

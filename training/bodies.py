@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgarment.cache import cache_folder
 from warpgarment.errors import MissingExtra
+from warpgarment.io.cache import cache_folder
 
 from .mesh_cutting import averaging, boundary_loops, compacted, without_short_edges
 

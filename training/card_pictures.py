@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment import draw
 from warpgarment.errors import MissingExtra
 from warpgarment.io.atomic import atomic_file
+from warpgarment.view import draw
 
 from .dataset import Sequence as SequenceOnDisk
 

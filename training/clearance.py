@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.geometry.skinning import linear_blend_skinning
 
 from .bodies import RestBody
 from .limbs import Contact, contacts, heads

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
-from warpgarment.garment import Garment
+from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.atomic import atomic_folder
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 
 from .encoding import decoded, encoded, stored_body, stored_transforms
 from .layout import AGAIN, ARRAYS, STORED, check_fit, expected

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 import tyro
 
-from warpgarment import checkpoint
 from warpgarment.errors import MissingExtra
-from warpgarment.simulator import Simulator
+from warpgarment.nn import checkpoint
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.tables.errors import OptionMissing
 from warpgarment.training.tables.options import TableName, TableOptions
 from warpgarment.training.tables.protocol import (

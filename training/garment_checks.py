@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import igl
 import numpy as np
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 
 from .bodies import RestBody
 from .layers import Sheet

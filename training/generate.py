@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 
 from .dataset import MANIFEST, write_sequence
 from .placement import body_motion, clothed

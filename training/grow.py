@@ -22,9 +22,10 @@ import math
 import torch
 from torch import nn
 
-from warpgarment.attention import EncoderLayer
-from warpgarment.config import NetworkConfig
-from warpgarment.network import STATISTICS, ManifoldAwareTransformer
+from warpgarment.nn.attention import EncoderLayer
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.network import STATISTICS
 
 MAY_DIFFER = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "dropout")
 UNEVEN = 0.5  # how far the shares of the copies of a channel are from equal

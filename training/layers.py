@@ -15,8 +15,8 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from warpgarment.garment import Garment
 from warpgarment.kernels import launch  # noqa: F401  (quietens Warp)
+from warpgarment.objects.garment import Garment
 
 REACH = 0.03
 _MILLIMETRES = wp.constant(wp.float64(1e3))

@@ -23,9 +23,9 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
 from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 
 from .baselines import kabsch
 

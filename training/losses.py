@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 import torch
 
-from warpgarment.network import GarmentNetwork, NormalisedOutput
+from warpgarment.nn.network import GarmentNetwork, NormalisedOutput
 
 
 @dataclass(frozen=True)

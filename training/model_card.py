@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment import checkpoint
-from warpgarment.config import NetworkConfig
 from warpgarment.io.atomic import atomic_file, atomic_folder
-from warpgarment.simulator import Simulator
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.sim.simulator import Simulator
 
 from .card import Facts
 from .dataset import Sequence as SequenceOnDisk

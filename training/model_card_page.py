@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.training.tables.protocol import FIGURES, METHODS, STARTS
 
 from .card_page import counts, credits, table
-from .evaluate import FIGURES, METHODS, STARTS
 
 if TYPE_CHECKING:
     from .card import Facts

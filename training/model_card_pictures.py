@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpgarment import draw
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
 from warpgarment.io.atomic import atomic_file
-from warpgarment.motion import GarmentMotion
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.motion import GarmentMotion
+from warpgarment.view import draw
 
 from .dataset import Sequence as SequenceOnDisk
 

@@ -12,9 +12,9 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from warpgarment.network import GarmentNetwork
-from warpgarment.parametrisation import NetworkOutput
-from warpgarment.patches import PatchLayout
+from warpgarment.nn.network import GarmentNetwork
+from warpgarment.nn.parametrisation import NetworkOutput
+from warpgarment.nn.patches.layout import PatchLayout
 
 from .distributed import Group
 from .losses import LossConfig, loss

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 import igl
 import numpy as np
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 
 from .bodies import RestBody
 from .garments import Pattern, make_garment, sampled_pattern

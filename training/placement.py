@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgarment.garment import Garment
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.geometry.skinning import linear_blend_skinning
+from warpgarment.objects.garment import Garment
 
 from .bodies import RestBody, anny_bodies, bundled_body
 from .clearance import resolve_clearance

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 
 from .layers import LayerFigures
 

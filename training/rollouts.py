@@ -10,7 +10,7 @@ import warnings
 
 import numpy as np
 
-from warpgarment.body import BodyMotion
+from warpgarment.objects.body import BodyMotion
 
 
 def predict(

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from warpgarment import checkpoint
 from warpgarment.metrics import mean_vertex_error
+from warpgarment.nn import checkpoint
 
 from . import state as training_state
 from .distributed import Group
@@ -259,7 +259,7 @@ class Run:
         return self.step % period == 0
 
     def _simulator(self):
-        from warpgarment.simulator import Simulator
+        from warpgarment.sim.simulator import Simulator
 
         return Simulator(self.average.network, self.device)
 

@@ -23,13 +23,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from warpgarment.config import NetworkConfig
-from warpgarment.heading import rotation_about_up
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
-from warpgarment.parametrisation import NetworkOutput, Step, context, targets
-from warpgarment.patches import Patches, PatchLayout, patch_layout
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.heading import rotation_about_up
+from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
+from warpgarment.nn.patches.layout import Patches, PatchLayout, patch_layout
 
 from .augmentation import Augmentation, mirror
 from .flops import step_flops

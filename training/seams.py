@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 
 _SAMPLES = 48  # points along an ideal line
 _APART = np.radians(30.0)  # between cuts

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
-from warpgarment.heading import yaw
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, inverse_rest_frames
 from warpgarment.kernels.mesh.laplacian import components
-from warpgarment.patches import Patches, garment_patches, patches
-from warpgarment.pooled_weights import dense_weights
+from warpgarment.nn.faces.layout import dense_weights
+from warpgarment.nn.heading import yaw
+from warpgarment.nn.patches.layout import Patches, garment_patches, patches
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 
 from .interactions import COLUMNS, UnusableSequence, cached
 from .noise import NoiseBasis

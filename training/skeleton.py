@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.geometry.skinning import linear_blend_skinning
 
 from .bodies import RestBody
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import torch
 
 from warpgarment.kernels.features.face import FEATURES
-from warpgarment.network import GarmentNetwork
+from warpgarment.nn.network import GarmentNetwork
 
 from .samples import Batch
 

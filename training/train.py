@@ -23,9 +23,10 @@ from pathlib import Path
 
 import torch
 
-from warpgarment import checkpoint
 from warpgarment.io.atomic import atomic_file
-from warpgarment.network import ManifoldAwareTransformer, PatchTransformer, build_network
+from warpgarment.nn import checkpoint
+from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
+from warpgarment.nn.patches.network import PatchTransformer
 
 from .distributed import Group, GroupError
 from .grow import grow

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from warpgarment.network import NetworkConfig
+from warpgarment.nn.config import NetworkConfig
 
 from .augmentation import Augmentation
 from .losses import LossConfig

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from warpgarment.body import BodyMotion
-from warpgarment.config import NetworkConfig
 from warpgarment.errors import MeshError
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.objects.body import BodyMotion
 
 from .dataset import Sequence, list_sequences, read_manifest
 from .distributed import Group

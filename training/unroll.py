@@ -2,8 +2,9 @@ r"""Training on several steps in a row: the network's own prediction becomes its
 
     predict -> compose -> singular values -> Poisson -> collisions -> features of the next frame -> predict -> ...
 
-with the methods of `warpgarment.scene.Scene`, which the simulator runs. Every step k = 1..K has the loss of one-step
-training, in the same normalised quantities, against the answer that leads from the predicted state to the recording:
+with the methods of `warpgarment.sim.scene.Scene`, which the simulator runs. Every step k = 1..K has the loss of
+one-step training, in the same normalised quantities, against the answer that leads from the predicted state to the
+recording:
 
     Psi_k = Phi_{t+k} Phi~_{t+k-1}^-1      Sigma_k = Sigma_{t+k}      q_k = z_{t+k} - z~_{t+k-1}      (~ predicted)
 
@@ -31,13 +32,14 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from warpgarment.batch import PaddedView
-from warpgarment.heading import canonical_frame
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.face import LAYOUT
-from warpgarment.network import ManifoldAwareTransformer, NetworkOutput, rotate_output
-from warpgarment.parametrisation import Step, compose, context, targets
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.heading import canonical_frame
+from warpgarment.nn.network import rotate_output
+from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
+from warpgarment.objects.pack import PaddedView
 
 from .augmentation import mirror
 from .losses import LossConfig, weighted

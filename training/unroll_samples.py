@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgarment.batch import PackedBodies
-from warpgarment.config import NetworkConfig
-from warpgarment.heading import rotation_about_up
-from warpgarment.history import History
 from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
-from warpgarment.network import ManifoldAwareTransformer
-from warpgarment.scene import Scene
-from warpgarment.timing import Timings
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.heading import rotation_about_up
+from warpgarment.objects.pack import PackedBodies
+from warpgarment.sim.history import History
+from warpgarment.sim.scene import Scene
+from warpgarment.sim.timing import Timings
 
 from .augmentation import Augmentation
 from .flops import step_flops

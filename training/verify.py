@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.report import table
+from warpgarment.view.report import table
 
 from .dataset import MANIFEST, Sequence, read_manifest
 from .layout import SPLITS

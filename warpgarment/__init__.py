@@ -6,15 +6,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import demo, draw, geodesics, memory, metrics
-    from .body import BodyMotion
+    from warpgarment.nn.config import NetworkConfig
+    from warpgarment.nn.faces.network import ManifoldAwareTransformer
+    from warpgarment.objects.body import BodyMotion
+    from warpgarment.objects.fit import fit
+    from warpgarment.objects.garment import Garment
+    from warpgarment.objects.motion import GarmentMotion
+    from warpgarment.objects.status import RolloutStatus, Verdict
+    from warpgarment.sim.simulator import Simulator
+
+    from . import demo, metrics
     from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
-    from .fitting import fit
-    from .garment import Garment
-    from .motion import GarmentMotion
-    from .network import ManifoldAwareTransformer, NetworkConfig
-    from .simulator import Simulator
-    from .status import RolloutStatus, Verdict
+    from .geometry import geodesics
+    from .sim import memory
+    from .view import draw
 
 __all__ = [
     "BodyMotion",
@@ -37,28 +42,35 @@ __all__ = [
     "metrics",
 ]
 
-# Where a public name lives. Names are imported when first used: `warpgarment --help` waits for neither torch nor Warp.
+# Where public names live. They are imported when first used: `warpgarment --help` waits for neither torch nor Warp.
 _HOME = {
-    "BodyMotion": "body",
+    "BodyMotion": "objects.body",
     "CheckpointError": "errors",
-    "Garment": "garment",
-    "GarmentMotion": "motion",
-    "ManifoldAwareTransformer": "network",
+    "Garment": "objects.garment",
+    "GarmentMotion": "objects.motion",
+    "ManifoldAwareTransformer": "nn.faces.network",
     "MeshError": "errors",
     "MissingExtra": "errors",
-    "NetworkConfig": "network",
+    "NetworkConfig": "nn.config",
     "NotEnoughMemory": "errors",
-    "RolloutStatus": "status",
-    "Simulator": "simulator",
-    "Verdict": "status",
-    "fit": "fitting",
+    "RolloutStatus": "objects.status",
+    "Simulator": "sim.simulator",
+    "Verdict": "objects.status",
+    "fit": "objects.fit",
+}
+_MODULES = {
+    "demo": "demo",
+    "draw": "view.draw",
+    "geodesics": "geometry.geodesics",
+    "memory": "sim.memory",
+    "metrics": "metrics",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = importlib.import_module(f".{_HOME.get(name, name)}", __name__)
+    home = importlib.import_module(f".{_HOME.get(name) or _MODULES[name]}", __name__)
     value = getattr(home, name) if name in _HOME else home
     globals()[name] = value
     return value

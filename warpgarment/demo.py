@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.io.usd import write_usd
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
+from warpgarment.objects.motion import GarmentMotion
+from warpgarment.view.report import rollout_table
 
-from . import draw, metrics
-from .body import BodyMotion
+from . import metrics
 from .errors import MeshError
-from .garment import Garment
-from .motion import GarmentMotion
-from .report import rollout_table
+from .view import draw
 
 ASSETS = Path(__file__).parent / "assets" / "demo"
 GARMENTS = ("dress", "tshirt")
@@ -108,7 +109,7 @@ def run(
     Returns:
         The garments' motions by name.
     """
-    from .simulator import Simulator
+    from warpgarment.sim.simulator import Simulator
 
     began = time.perf_counter()
     out, bundle = Path(out), assets(folder)

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from warpgarment.geometry.checks import check_edges, checked_faces, to_numpy
+from warpgarment.geometry.geodesics import distances_from, surface_graph
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-
-from .geodesics import distances_from, surface_graph
-from .mesh_checks import check_edges, checked_faces, to_numpy
 
 
 def mean_vertex_error(pred: Any, truth: Any) -> float:

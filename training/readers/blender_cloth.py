@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment.garment import Garment
 from warpgarment.kernels.wind import AIR_DENSITY, DRAG
+from warpgarment.objects.garment import Garment
 from warpgarment.training.materials import Material
 
 MIDDLE_MASS = 0.5  # of D-LAYERS' 0.2 to 0.8, Blender's mass of a vertex

@@ -15,10 +15,10 @@ from typing import cast
 
 import numpy as np
 
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
 from warpgarment.io.mesh import read_mesh
 from warpgarment.io.sequence import SequenceData, read_sequence
+from warpgarment.objects.body import BodyMotion
 from warpgarment.training.materials import Material
 
 from .recording import RecordedGarment, Recording, recorded_garment

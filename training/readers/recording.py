@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
-from warpgarment.garment import Garment
-from warpgarment.mesh_checks import checked_fps, checked_positions
-from warpgarment.mesh_clean import clean_mesh
+from warpgarment.geometry.checks import checked_fps, checked_positions
+from warpgarment.geometry.clean import clean_mesh
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.training.materials import Material
 
 from .smpl import SmplPoses

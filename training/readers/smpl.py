@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MeshError
 from warpgarment.io.npz import write_npz
+from warpgarment.objects.body import BodyMotion
 
 from .axes import y_up, z_up
 

@@ -6,9 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from warpgarment import checkpoint
-from warpgarment.simulator import Simulator
-from warpgarment.training.train import NonFiniteLoss, TrainConfig
+from warpgarment.nn import checkpoint
+from warpgarment.sim.simulator import Simulator
+from warpgarment.training.run import NonFiniteLoss
+from warpgarment.training.train_config import TrainConfig
 from warpgarment.training.training_set import folders_of
 
 from . import recipe, variants

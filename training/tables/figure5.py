@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment import checkpoint, demo, draw
-from warpgarment.report import STAGES
-from warpgarment.simulator import Simulator
+from warpgarment import demo
+from warpgarment.nn import checkpoint
+from warpgarment.sim.simulator import Simulator
+from warpgarment.view import draw
+from warpgarment.view.report import STAGES
 
 from .meshing import remesh
 from .pictures import axes_of, save

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warpgarment import checkpoint, draw
-from warpgarment.body import BodyMotion
-from warpgarment.motion import GarmentMotion
-from warpgarment.simulator import Simulator
+from warpgarment.nn import checkpoint
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.motion import GarmentMotion
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.rollouts import predict
 from warpgarment.training.training_set import folders_of
+from warpgarment.view import draw
 
 from .errors import DataLacks, OptionMissing
 from .meshing import remesh, surface_distance

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from warpgarment import checkpoint
-from warpgarment.simulator import Simulator
+from warpgarment.nn import checkpoint
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.dataset import read_manifest
 from warpgarment.training.recipes import TRAINING_CUTS
 from warpgarment.training.set_manifest import read_set_manifest

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warpgarment import checkpoint, demo, draw
-from warpgarment.simulator import Simulator
+from warpgarment import demo
+from warpgarment.nn import checkpoint
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.long_rollout import STILL, Limits, extended, figures, judged, settled, vertex_areas, walk
 from warpgarment.training.rollouts import predict
 from warpgarment.training.training_set import folders_of
+from warpgarment.view import draw
 
 from .errors import DataLacks, OptionMissing
 from .pictures import axes_of, save

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import igl
 import numpy as np
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 from warpgarment.training.mesh_cutting import remeshed
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment import draw
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
-from warpgarment.motion import GarmentMotion
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.motion import GarmentMotion
+from warpgarment.view import draw
 
 from .options import RESULTS
 from .protocol import FIGURES, STARTS

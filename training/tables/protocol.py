@@ -18,9 +18,9 @@ import numpy as np
 from tqdm import tqdm
 
 from warpgarment import metrics
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
-from warpgarment.simulator import Simulator
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.baselines import rigid, skinned
 from warpgarment.training.dataset import Sequence
 from warpgarment.training.rollouts import predict

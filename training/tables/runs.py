@@ -14,11 +14,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from warpgarment import checkpoint
 from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
+from warpgarment.nn import checkpoint
 from warpgarment.training.dataset import read_manifest
-from warpgarment.training.train import TrainConfig, train
+from warpgarment.training.train import train
+from warpgarment.training.train_config import TrainConfig
 from warpgarment.training.training_set import folders_of
 
 from .settings import described, differences

@@ -11,8 +11,8 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 
-from warpgarment.network import NetworkConfig
-from warpgarment.training.train import TrainConfig
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.training.train_config import TrainConfig
 
 from .settings import with_settings
 

@@ -16,7 +16,7 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
-from warpgarment.cache import cache_folder
+from warpgarment.io.cache import cache_folder
 
 from . import TeacherError
 

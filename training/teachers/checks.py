@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import j0
 
-from warpgarment.garment import Garment
+from warpgarment.objects.garment import Garment
 from warpgarment.training.materials import Material
 
 from . import Cloth, ClothScene, Teacher

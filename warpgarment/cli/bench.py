@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from warpgarment import demo
-from warpgarment.report import STAGES, table
+from warpgarment.view.report import STAGES, table
 
 from . import UsageError
 
@@ -34,7 +34,7 @@ def run(options: Bench) -> None:
     """Times the bundled dress on the bundled body."""
     import torch
 
-    from warpgarment.simulator import Simulator
+    from warpgarment.sim.simulator import Simulator
 
     if options.frames < 1 or min(options.batch, default=0) < 1:
         raise UsageError("--frames and --batch must be at least 1.")

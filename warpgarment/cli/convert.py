@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from warpgarment.body import BodyMotion
+from warpgarment.objects.body import BodyMotion
 
 from . import MOTION_FORMATS, check_output
 

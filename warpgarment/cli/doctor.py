@@ -45,10 +45,11 @@ def run(options: Doctor) -> None:
 
 def _self_check(device: str | None) -> str:
     """Rolls a tube out on a rising ball with an untrained network that moves it like skin."""
-    from warpgarment.body import BodyMotion
-    from warpgarment.garment import Garment
-    from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
-    from warpgarment.simulator import Simulator
+    from warpgarment.nn.config import NetworkConfig
+    from warpgarment.nn.faces.network import ManifoldAwareTransformer
+    from warpgarment.objects.body import BodyMotion
+    from warpgarment.objects.garment import Garment
+    from warpgarment.sim.simulator import Simulator
 
     began = time.perf_counter()
     ball, ball_faces = _tube(radius=0.2, height=0.4, around=24, rows=12, closed=True)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import tyro
 
-from warpgarment.body import BodyMotion
-from warpgarment.garment import Garment
-from warpgarment.report import rollout_table
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
+from warpgarment.view.report import rollout_table
 
 from . import MOTION_FORMATS, check_output
 
@@ -44,7 +44,7 @@ class Simulate:
 def run(options: Simulate) -> None:
     """Loads, fits if asked, rolls out, writes, and says how it went."""
     check_output(options.out, MOTION_FORMATS)
-    from warpgarment.simulator import Simulator
+    from warpgarment.sim.simulator import Simulator
 
     garment = Garment.load(options.garment, unit=options.unit)
     body = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh)
@@ -52,7 +52,7 @@ def run(options: Simulate) -> None:
     simulator.timings.synchronise = True
     first = None
     if options.fit_rest is not None:
-        from warpgarment.fitting import fit
+        from warpgarment.objects.fit import fit
 
         whole = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh, collider=False)
         rest = BodyMotion.load(options.fit_rest, unit=options.body_unit, collider=False)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import tyro
 
-from warpgarment import draw
-from warpgarment.body import BodyMotion
 from warpgarment.errors import MissingExtra
-from warpgarment.motion import GarmentMotion
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.motion import GarmentMotion
+from warpgarment.view import draw
 
 from . import UsageError, check_output
 

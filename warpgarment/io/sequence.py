@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.skinning import linear_blend_skinning
+from warpgarment.geometry.skinning import linear_blend_skinning
 
 from .atomic import atomic_files, atomic_folder
 from .mesh import READABLE, read_mesh, scale_of

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpgarment.errors import MeshError, MissingExtra
-from warpgarment.mesh_checks import checked_faces, checked_fps, checked_positions
+from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
 
 from .atomic import atomic_file
 from .polygons import triangulate_counts

@@ -1,0 +1,191 @@
+"""What a mesh must satisfy, and the sentences that say what is wrong, where, and what to do.
+
+A rest mesh is refused unless every edge has one or two faces, neighbouring faces agree on their outside, every face has
+an area and every vertex a face. Two patches that touch in a single vertex are accepted: nothing that follows needs
+more. A body mesh need only be finite with indices in range, because the distance queries skip faces that have no area.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from warpgarment.errors import MeshError
+
+REMEDY = "Use Garment.cleaned_from(vertices, faces), Garment.load(path, clean=True) for a file, or remove them."
+FLAT = 1e-6  # a face lower than this share of the mesh's size has no area: float32 positions cannot tell it from a line
+
+
+def to_numpy(array: Any) -> np.ndarray:
+    """A NumPy view or copy of an array, a nested list or a torch tensor on any device."""
+    if hasattr(array, "detach"):
+        array = array.detach().cpu()
+    return np.asarray(array)
+
+
+def complain(bad: np.ndarray, what: str, problem: str, remedy: str, element: str | None = None) -> None:
+    """Raises MeshError with count, total and first index where any entry of the mask is set.
+
+    Args:
+        bad: Mask over all elements, shape [N].
+        what: Plural name of the elements, such as ``faces``.
+        problem: What is wrong with them, after "of N faces".
+        remedy: What to do, as sentences of its own.
+        element: Singular name, where it is not `what` without its s.
+    """
+    if bad.any():
+        element = element or what.removesuffix("s")
+        count, first = int(np.count_nonzero(bad)), int(np.argmax(bad))
+        raise MeshError(f"{count:,} of {len(bad):,} {what} {problem} (first: {element} {first}). {remedy}")
+
+
+def checked_positions(
+    positions: Any, *, name: str = "vertices", frames: bool = False, finite: bool = True
+) -> np.ndarray:
+    """Positions as contiguous float32, shape [V,3], or [T,V,3] with `frames`.
+
+    Raises:
+        MeshError: Not numbers, another shape, no vertices, no frames, or NaN or infinity among them.
+    """
+    shape = "[T,V,3]" if frames else "[V,3]"
+    try:
+        array = to_numpy(positions)
+        if array.dtype.kind not in "fiu":
+            raise TypeError
+    except (TypeError, ValueError):
+        raise MeshError(f"{name} must be an array of numbers of shape {shape}.") from None
+    if array.ndim != (3 if frames else 2) or array.shape[-1] != 3:
+        raise MeshError(f"{name} must have shape {shape}, got {list(array.shape)}.")
+    if array.size == 0:
+        raise MeshError(f"{name} is empty: shape {list(array.shape)}. A mesh needs vertices and a motion needs frames.")
+    with np.errstate(over="ignore"):
+        array = np.ascontiguousarray(array, dtype=np.float32)
+    if finite:
+        bad = ~np.isfinite(array).all(axis=-1)
+        if frames and bad.any():
+            t, v = (int(i) for i in np.argwhere(bad)[0])
+            raise MeshError(
+                f"{np.count_nonzero(bad.any(axis=1)):,} of {len(bad):,} frames hold NaN or infinite positions "
+                f"(first: frame {t}, vertex {v}). Drop these frames or repair what wrote them."
+            )
+        if not frames:
+            complain(
+                bad, name, "are NaN or infinite", "Repair what wrote them.", "vertex" if name == "vertices" else None
+            )
+    return array
+
+
+def checked_faces(faces: Any, vertex_count: int, *, name: str = "faces", remedy: str = "Remove them.") -> np.ndarray:
+    """Faces as contiguous int32, shape [F,3], each index in [0, vertex_count).
+
+    Raises:
+        MeshError: Not integers, another shape, no faces, or an index out of range.
+    """
+    try:
+        array = to_numpy(faces)
+    except (TypeError, ValueError):
+        raise MeshError(f"{name} must be an integer array of shape [F,3].") from None
+    if array.size == 0:
+        raise MeshError(f"The mesh has no {name}. A point cloud cannot be simulated.")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise MeshError(f"{name} must have shape [F,3], got {list(array.shape)}. Split polygons into triangles first.")
+    if array.dtype.kind not in "iu":
+        raise MeshError(f"{name} must be integers, got {array.dtype}.")
+    bad = np.asarray(((array < 0) | (array >= vertex_count)).any(axis=1))
+    complain(bad, name, f"name vertices that do not exist: indices must lie in 0..{vertex_count - 1:,}", remedy, "face")
+    return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def repeated_vertices(faces: np.ndarray) -> np.ndarray:
+    """Mask [F] of faces that name a vertex twice."""
+    return (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+
+
+def no_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Mask [F] of faces whose smallest height is at most `FLAT` times the mesh's size.
+
+    The size is the diagonal of the bounding box, or the largest coordinate where the mesh lies far from the origin:
+    that is what float32 resolution is relative to.
+    """
+    used = vertices[np.unique(faces)].astype(np.float64)
+    size = max(float(np.linalg.norm(np.ptp(used, axis=0))), float(np.abs(used).max()))
+    corners = vertices.astype(np.float64)[faces]
+    edges = np.roll(corners, -1, axis=1) - corners
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return double_area <= FLAT * size * longest
+
+
+def duplicate_faces(faces: np.ndarray) -> np.ndarray:
+    """Mask [F] of faces whose three vertices an earlier face has already used, in any order."""
+    first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]
+    mask = np.ones(len(faces), dtype=bool)
+    mask[first] = False
+    return mask
+
+
+def directed_edges(faces: np.ndarray) -> np.ndarray:
+    """Directed edges (0,1), (1,2), (2,0) of each face, shape [3F,2]; edge k of face f is row 3f + k."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def check_rest_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Raises MeshError unless the arrays, already of the right types, form an oriented 2-manifold without leftovers."""
+    complain(repeated_vertices(faces), "faces", "name a vertex twice", REMEDY)
+    complain(no_area(vertices, faces), "faces", "have no area", REMEDY)
+    complain(duplicate_faces(faces), "faces", "repeat an earlier face", REMEDY)
+    check_edges(faces)
+    unused = np.ones(len(vertices), dtype=bool)
+    unused[faces] = False
+    complain(unused, "vertices", "belong to no face", REMEDY, "vertex")
+
+
+def check_edges(faces: np.ndarray) -> None:
+    """Raises MeshError where an edge has more than two faces or two neighbours disagree on their outside."""
+    directed = directed_edges(faces)
+    edges, edge_of, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
+    crowded = count > 2
+    if crowded.any():
+        first = int(np.argmax(crowded))
+        owners = np.nonzero(edge_of.reshape(-1) == first)[0] // 3
+        raise MeshError(
+            f"{np.count_nonzero(crowded):,} of {len(edges):,} edges have more than two faces (first: edge "
+            f"{edges[first, 0]}-{edges[first, 1]} of faces {', '.join(map(str, owners))}). {REMEDY}"
+        )
+    pairs, pair_of, count = np.unique(directed, axis=0, return_inverse=True, return_counts=True)
+    twice = count > 1
+    if twice.any():
+        first = int(np.argmax(twice))
+        a, b = np.nonzero(pair_of.reshape(-1) == first)[0][:2] // 3
+        raise MeshError(
+            f"{np.count_nonzero(twice):,} of {len(edges):,} edges join faces that disagree on which side is outside "
+            f"(first: faces {a} and {b} at edge {pairs[first, 0]}-{pairs[first, 1]}). "
+            "Use Garment.cleaned_from(vertices, faces), Garment.load(path, clean=True) for a file, or flip them."
+        )
+
+
+def checked_pins(pins: Any, vertex_count: int) -> np.ndarray:
+    """Pinned vertices as sorted, unique int32, shape [P]; None or nothing gives an empty array.
+
+    Raises:
+        MeshError: Not a list of integers, or an index out of range.
+    """
+    array = to_numpy([] if pins is None else pins)
+    if array.size == 0:
+        return np.zeros(0, dtype=np.int32)
+    if array.dtype.kind not in "iu" or array.ndim != 1:
+        raise MeshError(f"pins must be vertex indices of shape [P], got {array.dtype} of shape {list(array.shape)}.")
+    bad = (array < 0) | (array >= vertex_count)
+    complain(
+        bad, "pins", f"name vertices that do not exist: indices must lie in 0..{vertex_count - 1:,}", "Remove them."
+    )
+    return np.unique(array).astype(np.int32)
+
+
+def checked_fps(fps: Any) -> float:
+    """Frames per second as a positive, finite float, or MeshError."""
+    value = float(fps)
+    if not (np.isfinite(value) and value > 0):
+        raise MeshError(f"fps must be positive and finite, got {fps}.")
+    return value

@@ -1,0 +1,331 @@
+"""Distances over a garment's surface between the centroids of its faces.
+
+A shortest path on a triangle mesh is a chain of straight segments that bend only at vertices: at the border, and where
+the angles around a vertex sum to more than 2π (Mitchell, Mount and Papadimitriou 1987). So:
+
+1. From every face centroid and every such vertex, unfold the strips of faces around it into the plane, keeping for
+   each strip the window of directions that stay inside, and note what is seen through it: exact distances to the
+   neighbourhood.
+2. Chain these segments: `kernels/mesh/shortest_paths.py`.
+
+`face_geodesics` does this for all pairs, `local_geodesics` for pairs within a radius, without a matrix of F x F.
+
+With strips of unlimited length this is exact. They end at `REACH` times the source's own size, so a long straight
+segment becomes a chain of seen centroids that lie almost on it: distances are never too short, and a little too long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from warpgarment.errors import MeshError
+from warpgarment.kernels.mesh.shortest_paths import Paths, neighbourhoods, unit_of
+
+from .checks import check_edges, checked_faces, checked_positions, complain, no_area, repeated_vertices
+
+REACH = 2.5  # windows end this many times the source's longest edge away,
+CROSSED_REACH = 1.5  # or this many times the longest edge of any face crossed, for small faces to see past large ones,
+LEAST_DEPTH = 4  # but not before they have crossed this many faces,
+DEPTH = 400  # and in any case after this many
+SADDLE = 1e-3  # angle beyond 2 pi from which a vertex can bend a shortest path [rad]
+BLOCK = 512  # sources of one search of local distances
+FEW = 8  # sources, up to which preparing a graph for the faster search takes longer than it saves
+VERSION = 2  # raise it whenever the result changes: it is part of the name under which results are kept
+MEMORY_BUDGET = 8 * 2**30  # bytes of float32 distances that are still computed: about 46,000 faces
+
+
+def face_geodesics(rest_vertices: Any, faces: Any) -> np.ndarray:
+    """Distances over the surface between all face centroids.
+
+    Args:
+        rest_vertices: Positions [m], shape [V,3]; NumPy or torch.
+        faces: Vertex indices of an oriented manifold mesh, shape [F,3].
+
+    Returns:
+        Distances [m], float32, shape [F,F]; zero diagonal, symmetric, `inf` across components. Never shorter than the
+        exact polyhedral distance, and within 5 % of it.
+
+    Raises:
+        MeshError: Bad shapes or indices, positions that are not finite, non-manifold edges, faces without area, or a
+            matrix beyond `MEMORY_BUDGET`.
+    """
+    vertices, faces = checked_mesh(rest_vertices, faces)
+    need = 4 * len(faces) ** 2
+    if need > MEMORY_BUDGET:
+        raise MeshError(
+            f"Distances between {len(faces):,} faces need {need / 2**30:.0f} GiB, more than "
+            f"{MEMORY_BUDGET / 2**30:.0f}. Coarsen the garment, or raise warpgarment.geometry.geodesics.MEMORY_BUDGET."
+        )
+    every = np.arange(len(faces))
+    return Paths(surface_graph(vertices, faces), every).distances(every)
+
+
+def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix:
+    """Distances over the surface between face centroids no further apart than a radius, a row per face.
+
+    A path no longer than the radius stays in the ball of that radius around its start. So sources are taken in blocks
+    of neighbours, and the search sees only the part of the graph around a block: time and memory grow with
+    the number of pairs found.
+
+    Args:
+        rest_vertices: Positions [m], shape [V,3]; NumPy or torch.
+        faces: Vertex indices of an oriented manifold mesh, shape [F,3].
+        radius: Longest distance kept [m], positive; `inf` keeps all of the same component.
+
+    Returns:
+        Distances [m], float32, shape [F,F], symmetric, columns sorted. The diagonal is stored, as zeros; pairs further
+        apart are not stored. Stored values are those of `face_geodesics`.
+
+    Raises:
+        MeshError: As `face_geodesics`; pairs beyond `MEMORY_BUDGET`.
+        ValueError: A radius that is not positive.
+    """
+    if not radius > 0.0:
+        raise ValueError(f"radius must be positive, got {radius}")
+    vertices, faces = checked_mesh(rest_vertices, faces)
+    count = len(faces)
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    stored = 0
+    for block, inside, part in searches(vertices, faces, np.arange(count), radius):
+        row, column = np.nonzero((part <= radius) & (part < np.inf) & (block[:, None] < inside))
+        found.append((block[row], inside[column], part[row, column]))
+        stored += 2 * len(row)
+        if 8 * stored > MEMORY_BUDGET:
+            raise MeshError(
+                f"Distances up to {radius:g} m between {count:,} faces need more than {MEMORY_BUDGET / 2**30:.0f} GiB. "
+                "Coarsen the garment, lower the radius, or raise warpgarment.geometry.geodesics.MEMORY_BUDGET."
+            )
+    source, target, length = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    upper_half = csr_matrix((length, (source, target)), shape=(count, count))
+    diagonal = csr_matrix((np.zeros(count, np.float32), np.arange(count), np.arange(count + 1)), shape=(count, count))
+    return _stacked(upper_half, diagonal)
+
+
+def searches(
+    vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray, radius: float
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Searches from some faces for all within a radius, block by block of neighbours.
+
+    Args:
+        vertices: Positions [m], shape [V,3].
+        faces: Vertex indices, shape [F,3].
+        sources: Faces to start from, shape [S].
+        radius: How far to look [m].
+
+    Yields:
+        Sources of a block, shape [s]; the faces in its box, ascending, shape [n]; and distances [m], float32, shape
+        [s,n], `inf` (or just above the radius) for what is further away.
+    """
+    mesh = _Unfolding(vertices.astype(np.float64), faces.astype(np.int64))
+    graph, count = _segments(mesh), len(faces)
+    unit = unit_of(graph)
+    nodes = np.concatenate([vertices[faces].mean(axis=1), vertices[mesh.node_of_vertex >= 0]]).astype(np.float64)
+    del mesh
+    for chosen in neighbourhoods(nodes[sources], BLOCK):
+        block = sources[chosen]
+        low, high = nodes[block].min(axis=0) - 1.001 * radius, nodes[block].max(axis=0) + 1.001 * radius
+        inside = np.nonzero(((nodes >= low) & (nodes <= high)).all(axis=1))[0]
+        of_faces = np.searchsorted(inside, count)
+        part = Paths(graph[inside][:, inside], np.arange(of_faces), unit).distances(
+            np.searchsorted(inside, block), radius * (1 + 1e-6)
+        )  # float32 before they are compared, so that ties end as they do in the dense matrix
+        yield block, inside[:of_faces], part
+
+
+def _stacked(upper: csr_matrix, diagonal: csr_matrix) -> csr_matrix:
+    """The lower half, the diagonal and the upper half; a sum of matrices would drop the zeros."""
+    count = upper.shape[0]
+    parts = [upper.T.tocsr(), diagonal, upper]
+    row = np.concatenate([np.repeat(np.arange(count, dtype=np.int32), np.diff(part.indptr)) for part in parts])
+    indices = np.concatenate([part.indices for part in parts])
+    data = np.concatenate([part.data for part in parts])
+    result = csr_matrix((data, (row, indices)), shape=(count, count))
+    result.sort_indices()
+    return result
+
+
+def checked_mesh(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Float32 vertices and int32 faces of a mesh that paths can be found on; raises MeshError."""
+    vertices = checked_positions(rest_vertices, name="rest_vertices")
+    faces = checked_faces(faces, len(vertices))
+    complain(repeated_vertices(faces) | no_area(vertices, faces), "faces", "have no area", "Run garment.cleaned().")
+    check_edges(faces)
+    return vertices, faces
+
+
+def distances_from(graph: csr_matrix, sources: np.ndarray, face_count: int) -> np.ndarray:
+    """Distances [m] from some faces to all, float32, shape [S,F], over a graph of `surface_graph`. Those of fewer than
+    `FEW` faces are sums of float64, and may differ in the last bit from those of many."""
+    if len(sources) < FEW:
+        return dijkstra(graph, indices=sources)[:, :face_count].astype(np.float32)
+    return Paths(graph, np.arange(face_count)).distances(sources)
+
+
+def surface_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
+    """Straight segments over the surface: nodes are the F face centroids, then the vertices where paths may bend.
+
+    Args:
+        vertices: Positions [m], shape [V,3].
+        faces: Vertex indices, shape [F,3], every edge with one or two faces.
+
+    Returns:
+        Symmetric weights [m], float64, shape [F+K, F+K].
+    """
+    return _segments(_Unfolding(vertices.astype(np.float64), faces.astype(np.int64)))
+
+
+def _segments(mesh: _Unfolding) -> csr_matrix:
+    seen = [mesh.spread(mesh.from_centroids()), mesh.spread(mesh.from_vertices()), mesh.over_midpoints()]
+    source, target, length = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    del seen
+    rows = np.concatenate([source, target]).astype(np.int32, copy=False)
+    cols = np.concatenate([target, source]).astype(np.int32, copy=False)
+    del source, target
+    length = np.concatenate([length, length])
+    order = np.lexsort((length, cols, rows))
+    rows, cols, length = rows[order], cols[order], length[order]
+    del order
+    keep = np.ones(len(rows), dtype=bool)
+    keep[1:] = (rows[1:] != rows[:-1]) | (cols[1:] != cols[:-1])
+    keep &= rows != cols
+    return csr_matrix((length[keep], (rows[keep], cols[keep])), shape=(mesh.node_count,) * 2)
+
+
+class _Unfolding:
+    """Half-edge 3f + k runs from corner k of face f to corner k+1; windows are parallel arrays, one entry each."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+        self.faces, count = faces, len(faces)
+        corners = vertices[faces]
+        edges = np.roll(corners, -1, axis=1) - corners
+        self.length = np.maximum(np.linalg.norm(edges, axis=2).reshape(-1), 1e-30)
+        to_apex = np.roll(corners, -2, axis=1) - corners
+        along = np.einsum("fkc,fkc->fk", edges, to_apex).reshape(-1) / self.length
+        self.apex = np.stack(
+            [along, np.linalg.norm(np.cross(edges, to_apex), axis=2).reshape(-1) / self.length], axis=1
+        )
+        half = np.arange(3 * count)
+        self.tail, self.next = faces.reshape(-1), half - half % 3 + (half + 1) % 3
+        self.head = self.tail[self.next]
+        self.twin = self._twins(len(vertices))
+        angle = np.arctan2(self.apex[:, 1], along)
+        total = np.bincount(self.tail, weights=angle, minlength=len(vertices))
+        border = np.zeros(len(vertices), dtype=bool)
+        border[self.tail[self.twin < 0]] = border[self.head[self.twin < 0]] = True
+        bends = border | (total > 2 * np.pi + SADDLE)
+        self.node_of_vertex = np.full(len(vertices), -1)
+        self.node_of_vertex[bends] = count + np.arange(np.count_nonzero(bends))
+        self.node_count = count + np.count_nonzero(bends)
+        longest = self.length.reshape(-1, 3).max(axis=1)
+        vertex_reach = np.zeros(len(vertices))
+        np.maximum.at(vertex_reach, faces.reshape(-1), np.repeat(longest, 3))
+        self.reach = REACH * np.concatenate([longest, vertex_reach[bends]])
+        self.crossed_reach = CROSSED_REACH * longest
+
+    def _twins(self, vertex_count: int) -> np.ndarray:
+        forward, backward = self.tail * vertex_count + self.head, self.head * vertex_count + self.tail
+        order = np.argsort(forward)
+        place = np.minimum(np.searchsorted(forward[order], backward), len(order) - 1)
+        return np.where(forward[order][place] == backward, order[place], -1)
+
+    def over_midpoints(self):
+        """Neighbours by way of the middle of their edge, so that even faces without area are linked."""
+        half = np.nonzero(self.twin >= 0)[0]
+        to_middle = np.linalg.norm(
+            np.stack([self.length / 2, np.zeros(len(self.length))], axis=1) - self._centroids(), axis=1
+        )
+        return half // 3, self.twin[half] // 3, to_middle[half] + to_middle[self.twin[half]]
+
+    def _centroids(self) -> np.ndarray:
+        """Centroid of each half-edge's face, its tail at the origin and its head on the first axis, shape [3F,2]."""
+        return (np.stack([self.length, np.zeros(len(self.length))], axis=1) + self.apex) / 3
+
+    def from_centroids(self):
+        """Windows over the three edges of every face, seen from its centroid, and its own bending corners."""
+        half = np.arange(len(self.tail))
+        start = np.zeros((len(half), 2))
+        end = np.stack([self.length, np.zeros(len(half))], axis=1)
+        centroid = self._centroids()
+        source = half // 3
+        node = self.node_of_vertex[self.tail]
+        own = node >= 0
+        seen = (source[own], node[own], np.linalg.norm(centroid[own], axis=1))
+        return source, half, start - centroid, end - centroid, seen
+
+    def from_vertices(self):
+        """Windows over the edge opposite to every corner at a bending vertex, with that face's centroid and corners."""
+        corner = np.nonzero(self.node_of_vertex[self.tail] >= 0)[0]
+        source, half = self.node_of_vertex[self.tail[corner]], self.next[corner]
+        right = np.stack([self.length[corner], np.zeros(len(corner))], axis=1)
+        left = self.apex[corner]
+        neighbour = self.node_of_vertex[np.stack([self.head[corner], self.head[half]])]
+        own = neighbour >= 0
+        both = np.broadcast_to(source, own.shape)
+        reach = np.linalg.norm(np.stack([right, left]), axis=2)
+        seen = (
+            np.concatenate([source, both[own]]),
+            np.concatenate([corner // 3, neighbour[own]]),
+            np.concatenate([np.linalg.norm(right + left, axis=1) / 3, reach[own]]),
+        )
+        return source, half, right, left, seen
+
+    def spread(self, windows):
+        """Unfolds face after face; returns sources, targets and lengths [m] of all straight segments seen."""
+        source, half, right, left, seen = windows
+        ray_right, ray_left = right, left
+        reach = self.reach[source]
+        found = [seen]
+        for depth in range(DEPTH):
+            across = self.twin[half]
+            go = across >= 0
+            if depth >= LEAST_DEPTH:
+                go &= _distance_to_segment(right, left) < reach
+            if not go.any():
+                break
+            source, across, right, left = source[go], across[go], right[go], left[go]
+            ray_right, ray_left = ray_right[go], ray_left[go]
+            reach = np.maximum(reach[go], self.crossed_reach[across // 3])
+            # The twin runs from left to right with the new face on its far side.
+            unit = right - left
+            unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-30)
+            normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+            apex = left + self.apex[across, :1] * unit + self.apex[across, 1:] * normal
+            centroid = (left + right + apex) / 3
+            for point, node in (
+                (centroid, across // 3),
+                (apex, self.node_of_vertex[self.tail[self.next[self.next[across]]]]),
+            ):
+                size = np.linalg.norm(point, axis=1)
+                slack = -1e-9 * size
+                visible = (_cross(ray_right, point) >= slack * np.linalg.norm(ray_right, axis=1)) & (node >= 0)
+                visible &= _cross(point, ray_left) >= slack * np.linalg.norm(ray_left, axis=1)
+                found.append((source[visible].astype(np.int32), node[visible].astype(np.int32), size[visible]))
+            beside_right, beside_left = _cross(ray_right, apex), _cross(apex, ray_left)
+            tiny = 1e-12 * np.linalg.norm(apex, axis=1)
+            a = beside_right > tiny * np.linalg.norm(ray_right, axis=1)  # part of the window passes right of the apex
+            b = beside_left > tiny * np.linalg.norm(ray_left, axis=1)
+            right_side = self.next[across]
+            half = np.concatenate([right_side[a], self.next[right_side][b]])
+            narrowed_left = np.where((beside_left > 0)[:, None], apex, ray_left)
+            narrowed_right = np.where((beside_right > 0)[:, None], apex, ray_right)
+            source, reach = np.concatenate([source[a], source[b]]), np.concatenate([reach[a], reach[b]])
+            right, left = np.concatenate([right[a], apex[b]]), np.concatenate([apex[a], left[b]])
+            ray_right = np.concatenate([ray_right[a], narrowed_right[b]])
+            ray_left = np.concatenate([narrowed_left[a], ray_left[b]])
+        return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _distance_to_segment(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance of the origin from the segments a-b, shape [N]."""
+    d = b - a
+    t = np.clip(-np.einsum("ij,ij->i", a, d) / np.maximum(np.einsum("ij,ij->i", d, d), 1e-300), 0, 1)
+    return np.linalg.norm(a + t[:, None] * d, axis=1)

@@ -1,0 +1,227 @@
+"""Checkpoints: safetensors that hold the weights, the statistics and, as JSON, the `NetworkConfig`.
+
+One file, or a folder of shards with an index (`shards.py`). Metadata keys: `format` ("warpgarment.nn.faces.network"),
+`format_version`, `config`, and `notes`, a JSON object for whatever a training run wants to say about itself. Nothing in
+a checkpoint is executed when it is read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save as serialise
+
+from warpgarment.errors import CheckpointError
+from warpgarment.io.atomic import atomic_file
+from warpgarment.nn.faces.network import build_network
+
+from . import hub, shards
+from .config import NetworkConfig
+from .network import STATISTICS, GarmentNetwork
+
+FORMAT = "warpgarment.nn.faces.network"
+FORMAT_VERSION = 1
+WEIGHTS = Path(__file__).parents[1] / "assets" / "weights"  # networks that ship with the package
+LATER = {  # settings that older checkpoints do not have: their default is how it was then
+    "replace_singular_values",
+    "architecture",
+    "patch_spacing",
+    "face_embedding",
+    "face_feed_forward",
+    "face_layers",
+}
+_DTYPES = (torch.float32, torch.bfloat16, torch.float16)
+
+
+def save(
+    network: GarmentNetwork,
+    path: str | os.PathLike[str],
+    *,
+    dtype: torch.dtype | None = None,
+    notes: Mapping[str, object] | None = None,
+    max_shard_bytes: int | None = None,
+) -> None:
+    """Writes a checkpoint: beside its place, then renamed, so that nobody reads half of one.
+
+    Args:
+        network: What to write.
+        path: A file, or with `max_shard_bytes` a folder.
+        dtype: Of the weights in the file, float32 (None), bfloat16 or float16; statistics are always float32.
+        notes: Anything JSON can hold, kept in the metadata.
+        max_shard_bytes: Write a folder with an index, in the Hugging Face layout, no file of which is larger.
+
+    Raises:
+        CheckpointError: A weight or statistic is not finite.
+        ValueError: Another dtype, or a tensor that is larger than a shard may be.
+        FileExistsError: The folder holds something else than a checkpoint.
+    """
+    dtype = dtype or torch.float32
+    if dtype not in _DTYPES:
+        raise ValueError(f"dtype must be one of {', '.join(str(d)[6:] for d in _DTYPES)}, got {str(dtype)[6:]}")
+    tensors = {}
+    for name, tensor in network.state_dict().items():
+        tensor = tensor.detach().to("cpu", torch.float32 if name in STATISTICS else dtype).contiguous()
+        if not torch.isfinite(tensor).all():
+            raise CheckpointError(f"{name} is not finite in {str(dtype)[6:]}; nothing was written to {path}")
+        tensors[name] = tensor
+    metadata = {
+        "format": FORMAT,
+        "format_version": str(FORMAT_VERSION),
+        "config": json.dumps(dataclasses.asdict(network.config)),
+        "notes": json.dumps(dict(notes or {})),
+    }
+    if max_shard_bytes is not None:
+        shards.write(Path(path), tensors, metadata, max_shard_bytes)
+        return
+    with atomic_file(Path(path)) as temporary:
+        temporary.write_bytes(serialise(tensors, metadata=metadata))
+
+
+def load(path: str | os.PathLike[str], *, device: torch.device | str | None = None) -> GarmentNetwork:
+    """Reads a checkpoint.
+
+    Args:
+        path: A file or folder that `save` wrote.
+        device: Where the network goes; the CPU unless said otherwise.
+
+    Returns:
+        The network, of the kind its config says, in float32 and in evaluation mode.
+
+    Raises:
+        CheckpointError: No file, a truncated or foreign one, shards that do not belong together, or settings or tensors
+            that do not fit; says which.
+    """
+    contents = shards.contents(path)
+    path = contents.path
+    config, _ = _described(contents)
+    network = build_network(config)
+    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    _check_tensors(path, expected, contents.shapes)
+    tensors = contents.tensors()
+    for name, tensor in tensors.items():
+        if tensor.dtype not in _DTYPES:
+            raise CheckpointError(f"{path}: {name} is {str(tensor.dtype)[6:]}, expected a floating-point tensor")
+        if not torch.isfinite(tensor).all():
+            raise CheckpointError(f"{path}: {name} is not finite; the network was saved after training had diverged")
+        if name.endswith("_std") and name in STATISTICS and (tensor <= 0).any():
+            raise CheckpointError(f"{path}: {name} must be positive, smallest is {tensor.min().item():g}")
+    network.load_state_dict(tensors)
+    return network.to(device or "cpu").eval()
+
+
+def read_metadata(path: str | os.PathLike[str]) -> tuple[NetworkConfig, dict[str, object]]:
+    """The settings and the notes of a checkpoint, file or folder, without its weights.
+
+    Raises:
+        CheckpointError: As `load`.
+    """
+    return _described(shards.contents(path))
+
+
+def find(name: str | os.PathLike[str], *, device: torch.device | str | None = None) -> Path:
+    """The checkpoint of a name. What lies at a path of that name wins over what ships, and that over the Hub.
+
+    Args:
+        name: A checkpoint file, or a folder that holds one; "default" or the name of a network that ships; or a
+            repository of the Hugging Face Hub, `owner/name` or `owner/name@revision`, which is fetched.
+        device: Where it is going to run, which decides what "default" is: on a GPU `base`, where that ships, else what
+            default.txt among the weights names. None: a GPU where there is one, as in `Simulator`.
+
+    Returns:
+        A file, or a folder of shards.
+
+    Raises:
+        CheckpointError: There is none, or several; says what there is and what was tried.
+        MissingExtra: It can only be a repository, and huggingface-hub is not installed.
+    """
+    if Path(name).exists():
+        return shards.locate(name)
+    ships = _shipped()
+    wanted = os.fspath(name)
+    if wanted == "default":
+        wanted = _default(ships, device)
+    if wanted in ships:
+        return shards.locate(ships[wanted])
+    there = ", ".join(sorted(ships)) if ships else "none in this installation"
+    tried = f"no network {wanted!r}: neither a file, a folder, nor one that ships ({there})"
+    if not hub.is_repository(wanted):
+        raise CheckpointError(tried)
+    folder = hub.fetch(wanted, tried)
+    try:
+        return shards.locate(folder)
+    except CheckpointError as error:
+        raise CheckpointError(f"{wanted} on the Hugging Face Hub holds no network: {error}") from error
+
+
+def _shipped() -> dict[str, Path]:
+    """Networks of the package by name: files, and folders of shards."""
+    files = {file.stem: file for file in WEIGHTS.glob("*.safetensors")}
+    return files | {index.parent.name: index.parent for index in WEIGHTS.glob(f"*/{shards.INDEX}")}
+
+
+def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
+    gpu = torch.cuda.is_available() if device is None else torch.device(device).type != "cpu"
+    if gpu and "base" in ships:
+        return "base"
+    pointer = WEIGHTS / "default.txt"
+    return pointer.read_text(encoding="utf-8").strip() if pointer.is_file() else "default"
+
+
+def _described(contents: shards.Contents) -> tuple[NetworkConfig, dict[str, object]]:
+    path, metadata = contents.path, contents.metadata
+    if metadata.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: a safetensors file, but no warpgarment network (format {FORMAT!r} is missing)")
+    version = metadata.get("format_version", "")
+    if version != str(FORMAT_VERSION):
+        raise CheckpointError(
+            f"{path}: format version {version or 'missing'}, this warpgarment reads {FORMAT_VERSION}; update it"
+        )
+    settings = _json_object(path, "config", metadata)
+    return _config(path, settings), _json_object(path, "notes", metadata)
+
+
+def _check_tensors(path: object, expected: Mapping[str, tuple], found: Mapping[str, tuple]) -> None:
+    missing = sorted(expected.keys() - found.keys())
+    if missing:
+        raise CheckpointError(f"{path}: {len(missing)} tensors are missing (first: {missing[0]})")
+    extra = sorted(found.keys() - expected.keys())
+    if extra:
+        raise CheckpointError(f"{path}: {len(extra)} tensors do not belong to its config (first: {extra[0]})")
+    for name, shape in expected.items():
+        if found[name] != shape:
+            raise CheckpointError(f"{path}: {name} has shape {list(found[name])}, its config says {list(shape)}")
+
+
+def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[str, Any]:
+    try:
+        value = json.loads(metadata[key])
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(f"{path}: metadata {key!r} is missing or not JSON") from error
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{path}: metadata {key!r} is not a JSON object")
+    return value
+
+
+def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
+    fields = {field.name: field for field in dataclasses.fields(NetworkConfig)}
+    unknown = sorted(settings.keys() - fields.keys())
+    if unknown:
+        raise CheckpointError(f"{path}: unknown settings {', '.join(unknown)}; written by a newer warpgarment?")
+    missing = sorted(fields.keys() - settings.keys() - LATER)
+    if missing:
+        raise CheckpointError(f"{path}: settings {', '.join(missing)} are missing")
+    for name, value in settings.items():
+        kind = type(fields[name].default)
+        fits = isinstance(value, (int, float)) if kind is float else isinstance(value, kind)
+        if not fits or (isinstance(value, bool) and kind is not bool):
+            raise CheckpointError(f"{path}: setting {name} must be {kind.__name__}, got {value!r}")
+    try:
+        return NetworkConfig(**settings)
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}") from error

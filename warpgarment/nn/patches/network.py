@@ -1,0 +1,248 @@
+"""A network whose cost is linear in the faces: a transformer over patches of cloth, between layers of faces.
+
+    features [N, H*34] -> linear -> N faces -> face layer -+--------------------------> (+) -> face layers -> Psi, Sigma
+                                                           v pool                       ^ spread what changed
+                                                           P patches -> encoder layers -+
+    velocities [C, (H-1)*3] -> linear, + linear(mean) --> C tokens  ->  (attention.py) ------------------------> q
+
+The mean is that of the piece of cloth that the velocities are of. `patches.py` says how faces are pooled into patches
+and hear of them again. The encoder layers are those of the manifold-aware transformer, with geodesic distances between
+the patches' centres. A face layer is a small perceptron on each face; those after the patches also see the mean of its
+neighbours across the edges, so that folds much smaller than a patch are kept. At first they do not listen to it, so a
+network may be trained on subsets of faces, which have no neighbours, before it is on whole garments.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from warpgarment.kernels.features.face import FEATURES
+from warpgarment.nn import heading
+from warpgarment.nn.attention import ACTIVATIONS
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.network import GarmentNetwork, NormalisedOutput, rotate_output
+from warpgarment.nn.parametrisation import NetworkOutput
+
+from .layout import PatchLayout
+
+if TYPE_CHECKING:
+    from warpgarment.nn.faces.network import ManifoldAwareTransformer
+
+
+class FaceLayer(nn.Module):
+    """A residual perceptron on every face, normalised before.
+
+    Args:
+        embedding: Width of a face.
+        feed_forward: Width of the hidden layer.
+        activation: "relu" or "gelu".
+        hears: Whether the hidden layer also sees the mean of the face's neighbours; at first it does not listen.
+    """
+
+    def __init__(self, embedding: int, feed_forward: int, activation: str, hears: bool) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(embedding)
+        self.expand = nn.Linear(embedding, feed_forward)
+        self.contract = nn.Linear(feed_forward, embedding)
+        self.activation = ACTIVATIONS[activation]
+        if hears:
+            self.hear = nn.Linear(embedding, feed_forward, bias=False)
+            nn.init.zeros_(self.hear.weight)
+        self.hears = hears
+
+    def forward(self, x: torch.Tensor, neighbours: torch.Tensor | None) -> torch.Tensor:
+        """Faces of all garments [F,E] and their neighbours, int64 [F,3], None where there are none -> [F,E]."""
+        own = self.norm(x)
+        hidden = self.expand(own)
+        if self.hears:
+            around = torch.zeros_like(own) if neighbours is None else F.embedding_bag(neighbours, own, mode="mean")
+            hidden = hidden + self.hear(around)
+        return x + self.contract(self.activation(hidden))
+
+
+class PatchTransformer(GarmentNetwork):
+    """Faces, pooled into patches, which attend to each other.
+
+    Args:
+        config: Its shape and settings; `NetworkConfig.fast()` is the named one.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        width = config.face_embedding
+        self.embed_faces = nn.Linear(config.history * FEATURES, width)
+        self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
+        self.before = self._face_layer(hears=False)
+        self.to_patches = nn.Linear(width, config.embedding)
+        self.to_velocity = nn.Linear(width, config.embedding, bias=False)
+        self.layers = self.encoder_layers()
+        self.final_norm = nn.LayerNorm(config.embedding) if config.norm_first else nn.Identity()
+        self.from_patches = nn.Linear(config.embedding, width)
+        self.after = nn.ModuleList(self._face_layer(hears=True) for _ in range(config.face_layers))
+        self.face_norm = nn.LayerNorm(width)
+        self.face_head = nn.Linear(width, 12)
+        self.velocity_head = nn.Linear(config.embedding, 3)
+        self.start_like_skin()
+
+    @classmethod
+    def from_faces(cls, network: ManifoldAwareTransformer, config: NetworkConfig) -> PatchTransformer:
+        """A network of patches that starts from a trained one of faces, for training to go on.
+
+        Its layers are done to patches, faces hear how these changed, and face layers do nothing yet. If every face were
+        a patch, it would be the same network.
+
+        Args:
+            network: Whose weights and statistics are copied.
+            config: Of the new network, with the same widths (faces as wide as patches), layers, heads and history.
+
+        Raises:
+            ValueError: They differ, or the network normalises after its layers; says in what.
+        """
+        old = network.config
+        shared = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "history", "residual", "heading",
+                  "norm_first", "activation")  # fmt: skip
+        other = [name for name in shared if getattr(old, name) != getattr(config, name)]
+        if config.face_embedding != old.embedding:
+            other.append("face_embedding")
+        if other:
+            raise ValueError(f"a network of patches cannot start from this one of faces: {', '.join(other)} differ")
+        if not old.norm_first:
+            raise ValueError("a network of patches can only start from one with norm_first")
+        made = cls(config)
+        wanted = made.state_dict()
+        made.load_state_dict(wanted | {k: v for k, v in network.state_dict().items() if k in wanted})
+        made.face_norm.load_state_dict(network.final_norm.state_dict())
+        for linear in (made.to_patches, made.from_patches):
+            nn.init.eye_(linear.weight)
+            nn.init.zeros_(linear.bias)
+        nn.init.zeros_(made.to_velocity.weight)
+        for layer in (made.before, *made.after):
+            nn.init.zeros_(layer.contract.weight)
+            nn.init.zeros_(layer.contract.bias)
+        return made
+
+    def _face_layer(self, *, hears: bool) -> FaceLayer:
+        config = self.config
+        return FaceLayer(config.face_embedding, config.face_feed_forward, config.activation, hears)
+
+    def forward(
+        self,
+        face_features: torch.Tensor,
+        velocities: torch.Tensor,
+        weights: PatchLayout,
+        *,
+        face_mask: torch.Tensor | None = None,
+        velocity_mask: torch.Tensor | None = None,
+    ) -> NetworkOutput:
+        """As in `GarmentNetwork`, with the turn and the normalisation of the features done to the first weights."""
+        kind = face_features.device.type
+        half = torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False):  # half precision is for the transformer, not for positions
+            frame = None
+            if self.config.heading == "canonical":
+                frame = heading.canonical_frame(face_features, face_mask)
+                velocities = heading.rotate_vectors(velocities, frame)
+            if face_mask is not None:
+                face_features = torch.where(face_mask[..., None], face_features, 0.0)
+            faces = self._embedded(face_features, frame)
+            tokens = self.embed_velocity(self._without_padding(self.encode_velocities(velocities), velocity_mask))
+        with torch.autocast(kind, dtype=torch.get_autocast_dtype(kind), enabled=half):
+            normalised = self._from_embeddings(faces, tokens, weights, velocity_mask)
+        with torch.autocast(kind, enabled=False):
+            return rotate_output(self.denormalise(normalised), frame, inverse=True)
+
+    def _embedded(self, face_features: torch.Tensor, frame: torch.Tensor | None) -> torch.Tensor:
+        """What `embed_faces` makes of turned and normalised features, from those as they are.
+
+        W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
+        """
+        scaled = self.embed_faces.weight.unflatten(1, (-1, FEATURES)) / self.feature_std  # [E,H,34]
+        bias = self.embed_faces.bias - scaled.sum(dim=1) @ self.feature_mean
+        if frame is None:
+            return F.linear(face_features, scaled.flatten(1), bias)
+        turned = torch.einsum("ehi,bij->behj", scaled, heading.feature_rotation(frame)).flatten(2)
+        if len(turned) == 1:
+            return F.linear(face_features, turned[0], bias)
+        return torch.baddbmm(bias, face_features, turned.mT)
+
+    def forward_normalised(
+        self,
+        x: torch.Tensor,
+        v: torch.Tensor,
+        weights: PatchLayout,
+        *,
+        face_mask: torch.Tensor | None = None,
+        velocity_mask: torch.Tensor | None = None,
+    ) -> NormalisedOutput:
+        """The network itself: normalised inputs to normalised outputs, shapes as in `forward`."""
+        x, v = self._without_padding(x, face_mask), self._without_padding(v, velocity_mask)
+        with torch.autocast(x.device.type, enabled=False):  # differences of frames, which bfloat16 would round away
+            faces, tokens = self.embed_faces(x), self.embed_velocity(v)
+        return self._from_embeddings(faces, tokens, weights, velocity_mask)
+
+    @staticmethod
+    def _without_padding(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+        """Zero where padded: whatever padding holds, NaN too, must not spread."""
+        return values if mask is None else torch.where(mask[..., None], values, 0.0)
+
+    def _from_embeddings(
+        self, faces: torch.Tensor, tokens: torch.Tensor, weights: PatchLayout, velocity_mask: torch.Tensor | None
+    ) -> NormalisedOutput:
+        """Embedded faces [B,N,F] and velocities [B,C,E] -> normalised output."""
+        batch, count = faces.shape[:2]
+        patches = weights.start.shape[1]
+        row = torch.arange(batch, device=faces.device)[:, None, None]
+        neighbours = None if weights.neighbours is None else (weights.neighbours + count * row).flatten(0, 1)
+
+        faces = self.before(faces.flatten(0, 1), neighbours)
+        pooled = F.embedding_bag(
+            (weights.member + count * row[..., 0]).flatten(),
+            faces,
+            (weights.start + weights.member.shape[1] * row[..., 0]).flatten(),
+            mode="sum",
+            per_sample_weights=_rows(weights.member_weight, batch).flatten().to(faces.dtype),
+        )
+        pooled = pooled.unflatten(0, (batch, patches))
+        mean = _rows(weights.pieces, batch).to(pooled.dtype) @ pooled
+        tokens = torch.cat([self.to_patches(pooled), tokens + self.to_velocity(mean)], dim=1)
+        kind = faces.device.type
+        half = torch.is_autocast_enabled(kind)
+        geodesic = weights.weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
+        mask = self._key_mask(weights, velocity_mask, mean)
+        before = tokens
+        for layer in self.layers:
+            tokens = layer(tokens, geodesic, mask)
+        heard = self.from_patches((tokens - before)[:, :patches]).flatten(0, 1)
+        tokens = self.final_norm(tokens)
+        faces = faces + F.embedding_bag(
+            (weights.patch + patches * row).flatten(0, 1),
+            heard,
+            mode="sum",
+            per_sample_weights=_rows(weights.share, batch).flatten(0, 1).to(heard.dtype),
+        )
+        for layer in self.after:
+            faces = layer(faces, neighbours)
+        with torch.autocast(kind, enabled=False):
+            precise = self.face_head.weight.dtype
+            answer = self.face_head(self.face_norm(faces.to(precise))).unflatten(0, (batch, count))
+            psi, singular_values = answer.split([9, 3], dim=-1)
+            return NormalisedOutput(psi, singular_values, self.velocity_head(tokens[:, patches:].to(precise)))
+
+    @staticmethod
+    def _key_mask(weights: PatchLayout, velocity_mask: torch.Tensor | None, v: torch.Tensor) -> torch.Tensor | None:
+        """True where a token is real, shape [B,1,1,P+C]; None where all are."""
+        if weights.mask is None and velocity_mask is None:
+            return None
+        real = torch.ones((), dtype=torch.bool, device=v.device)
+        patch_mask = real.expand(*weights.start.shape) if weights.mask is None else weights.mask
+        velocity_mask = real.expand(*v.shape[:2]) if velocity_mask is None else velocity_mask
+        return torch.cat([patch_mask.expand(len(v), -1), velocity_mask], dim=1)[:, None, None]
+
+
+def _rows(values: torch.Tensor, batch: int) -> torch.Tensor:
+    """One row for each of the batch, where all share one."""
+    return values.expand(batch, *values.shape[1:])

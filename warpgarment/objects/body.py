@@ -1,0 +1,151 @@
+"""A body in motion: any triangle mesh whose vertices move."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgarment.errors import MeshError
+from warpgarment.geometry.checks import (
+    checked_faces,
+    checked_fps,
+    checked_positions,
+    complain,
+    no_area,
+    repeated_vertices,
+    to_numpy,
+)
+
+
+class BodyMotion:
+    """A deforming triangle mesh that a garment collides with.
+
+    The mesh may be open, in several parts, and intersect itself. Faces without area are ignored by the distance
+    queries; their number in the first frame is `degenerate_faces`.
+
+    Attributes:
+        vertices: Positions [m], Y up, float32, shape [T,V,3].
+        faces: Counter-clockwise seen from outside, int32, shape [F,3].
+        fps: Frames per second.
+
+    Args:
+        vertices: Positions [m], shape [T,V,3]; NumPy, torch or nested lists.
+        faces: Vertex indices, integers, shape [F,3].
+        fps: Frames per second, positive.
+
+    Raises:
+        MeshError: Other shapes, no frames or faces, NaN or infinity (named by frame), indices out of range, no face
+            with an area, or a rate that is not positive.
+    """
+
+    def __init__(self, vertices: Any, faces: Any, fps: float = 30.0):
+        self.vertices = checked_positions(vertices, frames=True)
+        self.faces = checked_faces(faces, self.vertices.shape[1])
+        self.fps = checked_fps(fps)
+        flat = repeated_vertices(self.faces) | no_area(self.vertices[0], self.faces)
+        self.degenerate_faces = int(np.count_nonzero(flat))
+        if flat.all():
+            complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
+
+    def __repr__(self) -> str:
+        frames, count = self.vertices.shape[:2]
+        return f"BodyMotion({frames:,} frames at {self.fps:g} fps, {count:,} vertices, {len(self.faces):,} faces)"
+
+    def __len__(self) -> int:
+        return self.frames
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.vertices)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike,
+        *,
+        unit: str | None = None,
+        fps: float | None = None,
+        collider: bool = True,
+        mesh: str | None = None,
+    ) -> BodyMotion:
+        """Reads a motion.
+
+        - ``.npz`` with `vertices` [T,V,3], `faces` [F,3] and `fps`;
+        - ``.npz`` with `rest_vertices`, `faces`, `bone_indices`, `bone_weights`, `bone_transforms`, `fps` and, where
+          parts such as hands take no part in collisions, `collider_faces` (bool, [F]);
+        - ``.pc2`` with a mesh of the same name beside it (``.obj``, else ``.ply``);
+        - ``.usd``, ``.usda``, ``.usdc``, ``.usdz``: a mesh with time samples;
+        - a folder of ``.obj`` files with the same faces, in the order of the numbers in their names;
+        - any mesh file that `Garment.load` reads, as a single frame.
+
+        Args:
+            path: File or folder.
+            unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that
+                USD files are converted by their own `metersPerUnit` and `upAxis`.
+            fps: Overrides the file's rate; 30 where neither says.
+            collider: Keep only the file's `collider_faces`, where it has any.
+            mesh: Name of the mesh to read where a USD file holds several.
+
+        Raises:
+            MeshError: The file is not of its kind or truncated, arrays do not fit each other, or as the constructor.
+            FileNotFoundError: There is no such file.
+        """
+        from warpgarment.io.sequence import read_sequence
+
+        path = Path(path)
+        data = read_sequence(path, unit=unit, mesh=mesh)
+        rate = fps if fps is not None else data.fps if data.fps is not None else 30.0
+        try:
+            motion = cls(data.vertices, data.faces, rate)
+            return motion.submesh(data.collider_faces) if collider and data.collider_faces is not None else motion
+        except MeshError as error:
+            raise MeshError(f"{path}: {error}") from None
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes .npz, .usd (.usda, .usdc), .pc2 with .obj beside it, or a folder of .obj; completely or not at all."""
+        from warpgarment.io.sequence import write_sequence
+
+        write_sequence(Path(path), self.vertices, self.faces, self.fps, name=Path(path).stem or "body")
+
+    def resampled(self, fps: float) -> BodyMotion:
+        """The motion at another rate, positions interpolated linearly in time.
+
+        Starts at the first frame and lasts as long as whole frames fit: floor((T - 1) fps' / fps) + 1 frames.
+
+        Args:
+            fps: New frames per second.
+
+        Raises:
+            MeshError: The rate is not positive.
+        """
+        fps = checked_fps(fps)
+        if fps == self.fps:
+            return self
+        last = self.frames - 1
+        count = int(np.floor(last * fps / self.fps + 1e-6)) + 1
+        time = np.minimum(np.arange(count) * (self.fps / fps), last)
+        before = np.minimum(time.astype(np.int64), max(last - 1, 0))
+        share = (time - before).astype(np.float32)[:, None, None]
+        vertices = self.vertices[before] * (1 - share) + self.vertices[np.minimum(before + 1, last)] * share
+        return BodyMotion(vertices, self.faces, fps)
+
+    def submesh(self, face_mask: Any) -> BodyMotion:
+        """The motion of some faces only, without the vertices that no face needs any more.
+
+        Args:
+            face_mask: True for faces to keep, bool, shape [F].
+
+        Raises:
+            MeshError: The mask has another shape or keeps nothing.
+        """
+        mask = to_numpy(face_mask)
+        if mask.dtype != bool or mask.shape != (len(self.faces),):
+            raise MeshError(f"face_mask must be bool [{len(self.faces):,}], got {mask.dtype} {list(mask.shape)}.")
+        if not mask.any():
+            raise MeshError("face_mask keeps no face.")
+        used, faces = np.unique(self.faces[mask], return_inverse=True)
+        return BodyMotion(self.vertices[:, used], faces.reshape(-1, 3), self.fps)

@@ -1,0 +1,202 @@
+"""A garment's rest mesh and what is computed from it once."""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from warpgarment.errors import MeshError
+from warpgarment.geometry.checks import (
+    REMEDY,
+    check_rest_mesh,
+    checked_faces,
+    checked_pins,
+    checked_positions,
+    directed_edges,
+)
+from warpgarment.geometry.clean import clean_mesh
+from warpgarment.io.cache import remembered
+
+if TYPE_CHECKING:
+    from warpgarment.geometry.pooled_geodesics import PooledGeodesics
+
+
+POOLED = 10_000  # faces beyond which the network's weights are pooled: F x F of them would take 400 MB
+KEPT = 1_000  # faces from which distances are kept on disk; with less they are quickly found
+
+
+class Garment:
+    """A garment at rest, checked when made: an oriented 2-manifold, open or closed, of one or more pieces.
+
+    Attributes:
+        vertices: Rest positions [m], Y up, float32, shape [V,3].
+        faces: Counter-clockwise seen from outside, int32, shape [F,3].
+        pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty where there are none.
+        name: For messages and file names.
+
+    What is cached (`edges`, `components`, `face_frames`, `geodesics`, `pooled_geodesics`, `laplacian`) belongs to
+    these arrays: make a new garment instead of changing them.
+
+    Args:
+        vertices: Rest positions [m], shape [V,3]; NumPy, torch or nested lists.
+        faces: Vertex indices, integers, shape [F,3].
+        pins: Vertex indices, shape [P].
+        name: Any text.
+
+    Raises:
+        MeshError: Names the element, the count and the remedy, for: other shapes, nothing in them, NaN or infinity,
+            indices out of range, a vertex twice in a face, faces without area (relative to the mesh's size), faces
+            given twice, edges of more than two faces, neighbours that disagree on the outside, vertices without a face.
+    """
+
+    def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = ""):
+        self.vertices = checked_positions(vertices)
+        self.faces = checked_faces(faces, len(self.vertices), remedy=REMEDY)
+        check_rest_mesh(self.vertices, self.faces)
+        self.pins = checked_pins(pins, len(self.vertices))
+        self.name = str(name)
+
+    def __repr__(self) -> str:
+        pins = f", {len(self.pins):,} pins" if len(self.pins) else ""
+        return f"Garment({self.name!r}, {len(self.vertices):,} vertices, {len(self.faces):,} faces{pins})"
+
+    @classmethod
+    def load(
+        cls, path: str | os.PathLike, unit: str | None = None, *, clean: bool = False, mesh: str | None = None
+    ) -> Garment:
+        """Reads a garment from .obj, .ply, .stl, .glb, .gltf, .npz or .usd (.usda, .usdc, .usdz).
+
+        Polygons become triangles. Vertices are never split at texture seams or normals: those of .obj, .ply, .npz
+        and .usd files come in the file's number and order. Formats that repeat vertices for every face (.stl) or seam
+        (.glb, .gltf) have vertices at exactly the same place joined again.
+
+        Args:
+            path: The file.
+            unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that
+                USD files are converted by their own `metersPerUnit` and `upAxis`.
+            clean: Repair the mesh as `cleaned_from` does, instead of refusing it.
+            mesh: Name of the mesh to read where a USD file holds several.
+
+        Raises:
+            MeshError: The file is not of its kind, is truncated, or holds a mesh that a garment cannot have.
+            FileNotFoundError: There is no such file.
+
+        Warns:
+            UserWarning: The garment is bigger than 10 m or smaller than 5 cm, so its unit is probably another.
+        """
+        from warpgarment.io.mesh import read_mesh
+
+        path = Path(path)
+        data = read_mesh(path, unit=unit, mesh=mesh)
+        try:
+            make = cls.cleaned_from if clean else cls
+            return make(data.vertices, data.faces, pins=data.pins, name=data.name or path.stem)
+        except MeshError as error:
+            raise MeshError(f"{path}: {error}") from None
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes .obj, .ply, .npz or .usd (.usda, .usdc), completely or not at all. Pins are kept in .npz only."""
+        from warpgarment.io.mesh import write_mesh
+
+        write_mesh(Path(path), self.vertices, self.faces, pins=self.pins, name=self.name)
+
+    @classmethod
+    def cleaned_from(cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "") -> Garment:
+        """A garment from a mesh that the constructor refuses.
+
+        Vertices closer than 1e-6 of the bounding box become one; vertices that are not finite go with their faces;
+        faces go that have indices out of range, a vertex twice, no area, or that repeat another; where more than two
+        faces share an edge the largest two stay; neighbours are flipped to agree, the majority deciding; vertices
+        without a face go. Pins follow their vertices.
+
+        Args:
+            vertices: Rest positions [m], shape [V,3].
+            faces: Vertex indices, shape [F,3].
+            pins: Vertex indices before cleaning, shape [P].
+            name: Any text.
+
+        Raises:
+            MeshError: Nothing is left, or the arrays have another shape.
+        """
+        new_vertices, new_faces, went = clean_mesh(vertices, faces)
+        new_pins = went[checked_pins(pins, len(went))]
+        return cls(new_vertices, new_faces, pins=new_pins[new_pins >= 0], name=name)
+
+    def cleaned(self) -> Garment:
+        """A cleaned copy: joins vertices at the same place, such as the two sides of a seam. See `cleaned_from`."""
+        return self.cleaned_from(self.vertices, self.faces, pins=self.pins, name=self.name)
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Undirected edges, lower index first, sorted, int32, shape [E,2]."""
+        return np.unique(np.sort(directed_edges(self.faces), axis=1), axis=0)
+
+    @cached_property
+    def components(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """Connected pieces by lowest vertex: of each vertex int32 [V], of each face int32 [F], and their count."""
+        from warpgarment.kernels.mesh.laplacian import components
+
+        return components(len(self.vertices), self.faces)
+
+    @cached_property
+    def face_frames(self) -> np.ndarray:
+        """Columns e1, e2 (the edges from a face's first vertex) and the unit normal, float32, shape [F,3,3]."""
+        corners = self.vertices.astype(np.float64)[self.faces]
+        e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        normal = np.cross(e1, e2)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return np.stack([e1, e2, normal], axis=2).astype(np.float32)
+
+    @cached_property
+    def geodesics(self) -> np.ndarray:
+        """Distances over the surface between face centroids [m], float32, shape [F,F]; see `face_geodesics`.
+
+        From 1,000 faces they are kept on disk, see `cache.remembered`.
+        """
+        from warpgarment.geometry.geodesics import VERSION, face_geodesics
+
+        count = len(self.faces)
+        if count < KEPT:
+            return face_geodesics(self.vertices, self.faces)
+        return remembered(
+            f"geodesics-{VERSION}",
+            [self.vertices, self.faces],
+            {"distances": ("float32", (count, count))},
+            lambda: {"distances": face_geodesics(self.vertices, self.faces)},
+        )["distances"]
+
+    @property
+    def pools(self) -> bool:
+        """Whether the network's geodesic weights are pooled: beyond 10,000 faces."""
+        return len(self.faces) > POOLED
+
+    @cached_property
+    def pooled_geodesics(self) -> PooledGeodesics:
+        """Distances between some thousand centres, and from them to all faces; kept on disk like `geodesics`."""
+        from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR, VERSION, PooledGeodesics, pooled_geodesics
+
+        count = len(self.faces)
+        expected = {
+            "distances": ("float32", (None, None)),
+            "nearest": ("int32", (count, NEAR)),
+            "weight": ("float32", (count, NEAR)),
+        }
+        found = remembered(
+            f"pooled-{VERSION}",
+            [self.vertices, self.faces, CENTRES],
+            expected,
+            lambda: pooled_geodesics(self.vertices, self.faces)._asdict(),
+        )
+        return PooledGeodesics(**found)
+
+    @cached_property
+    def laplacian(self) -> csr_matrix:
+        """Cotangent Laplacian of the rest mesh, positive semi-definite, float64, shape [V,V]."""
+        from warpgarment.kernels.mesh.laplacian import cotangent_laplacian
+
+        return cotangent_laplacian(self.vertices, self.faces)

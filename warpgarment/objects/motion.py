@@ -1,0 +1,111 @@
+"""A garment in motion: what a rollout returns."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgarment.errors import MeshError
+from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
+
+from .status import RolloutStatus, Verdict
+
+
+class GarmentMotion:
+    """Positions of a garment over time, with one status a frame.
+
+    Attributes:
+        vertices: Positions [m], Y up, float32, shape [T,V,3]. A rollout that went wrong may hold NaN: see `status`.
+        faces: int32, shape [F,3].
+        fps: Frames per second.
+        status: One `RolloutStatus` a frame, or empty where there was no simulation.
+        name: For messages and file names.
+
+    Raises:
+        MeshError: Shapes that do not fit, indices out of range, or as many statuses as there are not frames.
+    """
+
+    def __init__(
+        self, vertices: Any, faces: Any, fps: float = 30.0, status: Sequence[RolloutStatus] = (), name: str = ""
+    ):
+        self.vertices = checked_positions(vertices, frames=True, finite=False)
+        self.faces = checked_faces(faces, self.vertices.shape[1])
+        self.fps = checked_fps(fps)
+        self.status = list(status)
+        self.name = str(name)
+        if self.status and len(self.status) != len(self.vertices):
+            raise MeshError(f"{len(self.status)} statuses for {len(self.vertices)} frames. Give one a frame, or none.")
+
+    def __repr__(self) -> str:
+        frames, count = self.vertices.shape[:2]
+        return f"GarmentMotion({self.name!r}, {frames:,} frames at {self.fps:g} fps, {count:,} vertices)"
+
+    def __len__(self) -> int:
+        return self.frames
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.vertices)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the motion, completely or not at all.
+
+        - ``.npz``: positions, faces, rate and status; `load` reads it back without loss;
+        - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample a frame (extra ``usd``), Y up, metres;
+        - ``.pc2``: Blender's and others' point cache, with the first frame as ``.obj`` of the same name beside it;
+        - no suffix: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is replaced if it
+          holds nothing else.
+
+        Args:
+            path: Where to; parent folders are made.
+
+        Raises:
+            ValueError: Another suffix.
+            FileExistsError: The folder holds files that are not frames.
+            MissingExtra: USD without ``pip install "warpgarment[usd]"``.
+        """
+        from warpgarment.io.sequence import write_sequence
+
+        write_sequence(
+            Path(path), self.vertices, self.faces, self.fps, name=self.name or "garment", extra=self._status_arrays()
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> GarmentMotion:
+        """Reads what `save` wrote as .npz.
+
+        Raises:
+            MeshError: Not such a file.
+            FileNotFoundError: There is no such file.
+        """
+        from warpgarment.io.npz import read_npz
+
+        path = Path(path)
+        data = read_npz(path, required=("vertices", "faces", "fps"))
+        try:
+            status: list[RolloutStatus] = []
+            if "status_finite" in data:
+                verdicts = [Verdict(str(v)) for v in data["status_verdict"]]
+                columns = [data[f"status_{key}"].tolist() for key in _STATUS]
+                rows = zip(*columns, verdicts, strict=True)
+                status = [RolloutStatus(*row) for row in rows]
+            name = str(data["name"]) if "name" in data else path.stem
+            return cls(data["vertices"], data["faces"], float(data["fps"]), status, name)
+        except (MeshError, KeyError, ValueError, TypeError) as error:
+            raise MeshError(f"{path}: {error}") from None
+
+    def _status_arrays(self) -> dict[str, np.ndarray]:
+        arrays = {"name": np.array(self.name)}
+        if self.status:
+            for key in _STATUS:
+                arrays[f"status_{key}"] = np.array([getattr(s, key) for s in self.status])
+            arrays["status_verdict"] = np.array([s.verdict.value for s in self.status])
+        return arrays
+
+
+_STATUS = ("frame", "finite", "max_penetration", "poisson_iterations", "collision_iterations")

@@ -1,0 +1,92 @@
+"""Writing pictures: PNG, MP4, captions. Needs the extra `view`; files appear complete or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from warpgarment.errors import MissingExtra
+from warpgarment.io.atomic import atomic_file
+
+INK, MUTED = "#2f3640", "#77808c"
+
+
+def caption(image: np.ndarray, text: str) -> np.ndarray:
+    """The picture with small grey text in its lower left corner."""
+    size = max(11, image.shape[0] // 26)
+    return _written(image, text, (size // 2, image.shape[0] - size - size // 2), size, MUTED)
+
+
+def titled(image: np.ndarray, text: str, size: int = 15) -> np.ndarray:
+    """The picture below a band with a line of text."""
+    band = np.full((2 * size, image.shape[1], 3), 255, dtype=np.uint8)
+    return np.concatenate([_written(band, text, (size // 2, size // 2 - 1), size, INK), image])
+
+
+def _written(image: np.ndarray, text: str, corner: tuple[int, int], size: int, color: str) -> np.ndarray:
+    with _needs_view():
+        from PIL import Image, ImageDraw, ImageFont
+    picture = Image.fromarray(image)
+    ImageDraw.Draw(picture).text(corner, text, fill=color, font=ImageFont.load_default(size))
+    return np.asarray(picture)
+
+
+def write_png(path: str | Path, image: np.ndarray, *, colors: int | None = None) -> None:
+    """Writes uint8 [H, W, 3]; the file appears complete or not at all.
+
+    Args:
+        path: Of the file.
+        image: The picture.
+        colors: Size of the palette, at most 256, which makes the file three times smaller; None: all colours are kept.
+    """
+    with _needs_view():
+        import imageio.v3 as iio
+        from PIL import Image
+    with atomic_file(Path(path)) as temporary:
+        if colors is None:
+            iio.imwrite(temporary, image, extension=".png")
+        else:
+            Image.fromarray(image).quantize(colors, kmeans=2).save(temporary, "PNG", optimize=True)
+
+
+def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float = 30.0) -> int:
+    """Writes pictures, uint8 [H, W, 3] of one size, as an H.264 film that browsers play; returns how many."""
+    with _needs_view():
+        import imageio_ffmpeg
+    count, sink = 0, None
+    with atomic_file(Path(path)) as temporary:
+        try:
+            for image in frames:
+                height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2  # 4:2:0 needs even numbers
+                image = np.ascontiguousarray(image[:height, :width])
+                if sink is None:
+                    sink = imageio_ffmpeg.write_frames(
+                        str(temporary),
+                        (width, height),
+                        fps=fps,
+                        codec="libx264",
+                        quality=None,
+                        macro_block_size=2,
+                        pix_fmt_out="yuv420p",
+                        output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
+                    )
+                    sink.send(None)
+                sink.send(image)
+                count += 1
+        finally:
+            if sink is not None:
+                sink.close()
+        if count == 0:
+            raise ValueError("write_mp4 was given no frame; pass at least one")
+    return count
+
+
+@contextlib.contextmanager
+def _needs_view() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtra("view", "Writing pictures and films") from error
