@@ -1,6 +1,6 @@
 """Checkpoints: safetensors that hold the weights, the statistics and, as JSON, the `NetworkConfig`.
 
-One file, or a folder of shards with an index (`shards.py`). Metadata keys: `format` ("warpgarment.nn.faces.network"),
+One file, or a folder of shards with an index (`shards.py`). Metadata keys: `format` ("warpgarment.network"),
 `format_version`, `config`, and `notes`, a JSON object for whatever a training run wants to say about itself. Nothing in
 a checkpoint is executed when it is read.
 """
@@ -25,7 +25,7 @@ from . import hub, shards
 from .config import NetworkConfig
 from .network import STATISTICS, GarmentNetwork
 
-FORMAT = "warpgarment.nn.faces.network"
+FORMAT = "warpgarment.network"
 FORMAT_VERSION = 1
 WEIGHTS = Path(__file__).parents[1] / "assets" / "weights"  # networks that ship with the package
 LATER = {  # settings that older checkpoints do not have: their default is how it was then
