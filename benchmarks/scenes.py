@@ -12,7 +12,7 @@ from gpytoolbox import remesh_botsch
 from warpgarment import demo
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training.mesh_cutting import without_short_edges
+from warpgarment.training.meshes.cutting import without_short_edges
 
 MOST_REMESHED = 100_000  # faces; remeshing further leaves faces without area, so each face is cut into four instead
 

@@ -13,9 +13,9 @@ import numpy as np
 import tyro
 
 import warpgarment as wg
-from warpgarment.training.dataset import write_sequence
-from warpgarment.training.train import train
-from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.data.sequence import write_sequence
+from warpgarment.training.train.config import TrainConfig
+from warpgarment.training.train.start import train
 
 
 def write_own_data(folder: Path, frames: int) -> None:

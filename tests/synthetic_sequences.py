@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from warpgarment.training.dataset import write_sequence
+from warpgarment.training.data.sequence import write_sequence
 
 
 def tube(around: int, rings: int, radius: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

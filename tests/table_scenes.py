@@ -10,7 +10,7 @@ import torch
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.training.evaluate import EvaluateConfig
+from warpgarment.training.evaluate.measure import EvaluateConfig
 from warpgarment.training.tables.options import TableOptions
 
 SHAPE = ("dropout=0.0", "embedding=16", "layers=1", "feed_forward=16", "heads=2", "manifold_heads=1")

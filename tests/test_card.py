@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import synthetic_sequences
 
-from warpgarment.training.card import EmptyDataset, chosen, kind_of_reason, write_card
-from warpgarment.training.set_manifest import write_set_manifest
+from warpgarment.training.data.card import EmptyDataset, chosen, kind_of_reason, write_card
+from warpgarment.training.data.set_manifest import write_set_manifest
 
 CMU = "mocap.cs.cmu.edu"
 SLIP = "frame 9: slip 200.0 mm is over 150 mm"

@@ -10,9 +10,9 @@ import pytest
 from data_bodies import rest_body
 from scipy.spatial.transform import Rotation
 
-from warpgarment.training import skeleton
-from warpgarment.training.clearance import resolve_clearance
-from warpgarment.training.procedural import procedural
+from warpgarment.training.bodies import skeleton
+from warpgarment.training.bodies.limb_clearance import resolve_clearance
+from warpgarment.training.motions.procedural import procedural
 
 GAP = 0.02
 FRAMES, PRESSED = 80, slice(24, 56)

@@ -118,7 +118,7 @@ def test_convert_keeps_positions(scene) -> None:
 def test_an_animation_becomes_part_of_a_data_set(scene, capsys) -> None:
     """Own simulations in other units cannot be trained on, or become a hundred times too large. 16-bit: 1e-5 m."""
     from warpgarment.objects.garment import Garment
-    from warpgarment.training.dataset import Sequence
+    from warpgarment.training.data.sequence import Sequence
 
     rest = Garment.load(scene / "band.obj", unit="cm")
     lift = np.float32([0, 0.01, 0]) * np.arange(5, dtype=np.float32)[:, None, None]
@@ -201,7 +201,7 @@ def test_missing_extras_are_named(scene, capsys, monkeypatch) -> None:
     text = _error(capsys, "convert", scene / "body.npz", scene / "body.usd")
     assert 'pip install "warpgarment[usd]"' in text
 
-    import warpgarment.training.generate as generate
+    import warpgarment.training.generate.run as generate
 
     def without_newton(_config):
         raise ModuleNotFoundError("No module named 'newton'", name="newton.solvers")

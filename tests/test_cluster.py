@@ -7,7 +7,7 @@ import signal
 
 import ray
 
-from warpgarment.training.cluster import on_cluster
+from warpgarment.training.generate.cluster import on_cluster
 
 
 def test_results_and_errors_come_back_from_a_cluster_on_this_machine():

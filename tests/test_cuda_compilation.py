@@ -12,7 +12,7 @@ import warpgarment.kernels
 ARCHITECTURE = 90  # an H100
 
 NAMES = [m.name for m in pkgutil.walk_packages(warpgarment.kernels.__path__, "warpgarment.kernels.")]
-NAMES += ["warpgarment.training.teachers._newton_kernels"]
+NAMES += ["warpgarment.training.teachers.newton.kernels"]
 
 
 def warp_modules(name: str) -> dict[str, wp.Module]:
@@ -25,9 +25,9 @@ def warp_modules(name: str) -> dict[str, wp.Module]:
 
 def test_kernels_are_found():
     """Discovery would pass an empty list to the test below."""
-    assert {"deformation", "singular_values", "closest", "inside", "sdf", "features", "wind", "_newton_kernels"} <= {
-        name.rpartition(".")[2] for name in NAMES if warp_modules(name)
-    }
+    found = {name.partition(".")[2] for name in NAMES if warp_modules(name)}
+    assert {"kernels.deformation.gradients", "kernels.deformation.svd", "kernels.sdf.closest"} <= found
+    assert {"kernels.sdf.inside", "kernels.features.face", "kernels.wind", "training.teachers.newton.kernels"} <= found
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -15,8 +15,8 @@ from warpgarment import demo
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.objects.garment import Garment
-from warpgarment.training import dataset
-from warpgarment.training.quality import Limits, QualityGate
+from warpgarment.training.data import sequence as dataset
+from warpgarment.training.generate.quality import Limits, QualityGate
 
 
 def _shirt(frames: int = 5) -> dict[str, np.ndarray]:

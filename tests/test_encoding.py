@@ -8,7 +8,7 @@ from data_bodies import rest_body
 from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
-from warpgarment.training import encoding
+from warpgarment.training.data import encoding
 
 
 def _rotations() -> np.ndarray:

@@ -16,10 +16,10 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training import evaluate
 from warpgarment.training.baselines import kabsch, rigid, skinned
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.evaluate import EvaluateConfig, NoTestData
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.evaluate import measure as evaluate
+from warpgarment.training.evaluate.measure import EvaluateConfig, NoTestData
 from warpgarment.training.tables.errors import OptionMissing
 
 

@@ -12,7 +12,7 @@ import torch
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.training.evaluate import EvaluateConfig, NoTestData, evaluate
+from warpgarment.training.evaluate.measure import EvaluateConfig, NoTestData, evaluate
 from warpgarment.training.tables import groups, runs
 from warpgarment.training.tables.options import TableOptions
 

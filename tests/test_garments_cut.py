@@ -12,9 +12,9 @@ from data_bodies import rest_body
 from scipy.spatial import cKDTree
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.garment_checks import faults
-from warpgarment.training.garments import CATEGORIES, Pattern, make_garment, needs_forearms, sampled_pattern
-from warpgarment.training.mesh_cutting import (
+from warpgarment.training.garments.faults import faults
+from warpgarment.training.garments.make import CATEGORIES, Pattern, make_garment, needs_forearms, sampled_pattern
+from warpgarment.training.meshes.cutting import (
     boundary_loops,
     cut_below_zero,
     evened_boundary,

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warpgarment.training.dataset import Sequence, list_sequences, read_manifest
-from warpgarment.training.generate import generate, make_sequences, numbers_to_make
-from warpgarment.training.recipes import GenerateConfig
-from warpgarment.training.set_manifest import DatasetMismatch
-from warpgarment.training.verify import verify
+from warpgarment.training.data.sequence import Sequence, list_sequences, read_manifest
+from warpgarment.training.data.set_manifest import DatasetMismatch
+from warpgarment.training.data.verify import verify
+from warpgarment.training.generate.recipes import GenerateConfig
+from warpgarment.training.generate.run import generate, make_sequences, numbers_to_make
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_other_options_in_the_same_folder_are_refused(made, config):
 
 def test_a_rejected_sequence_keeps_its_reason_and_can_be_made_again(config, tmp_path, monkeypatch):
     """If this fails, nobody can find out why a sequence was rejected."""
-    from warpgarment.training import quality
+    from warpgarment.training.generate import quality
 
     monkeypatch.setattr(quality.Limits, "__init__", _strict(quality.Limits.__init__))
     strict = replace(config, out=tmp_path, attempts=2)

@@ -11,9 +11,9 @@ from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.grow import GrowthError, grow
-from warpgarment.training.pushforward import PushforwardConfig
-from warpgarment.training.train import train
-from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.samples.pushforward import PushforwardConfig
+from warpgarment.training.train.config import TrainConfig
+from warpgarment.training.train.start import train
 
 SMALL = NetworkConfig.small(embedding=16, layers=2, feed_forward=24, heads=4, manifold_heads=2, dropout=0.0, history=3)
 SHAPES = {

@@ -9,7 +9,7 @@ import trimesh
 
 from warpgarment.metrics import layer_collision
 from warpgarment.objects.garment import Garment
-from warpgarment.training.layers import LayerFigures, Sheet
+from warpgarment.training.garments.layers import LayerFigures, Sheet
 
 
 def _sheet(height: float, cells: int = 10, size: float = 0.4) -> Garment:

@@ -16,10 +16,10 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.evaluate import EvaluateConfig, evaluate
-from warpgarment.training.long_rollout import Limits, extended, figures, judged, there_and_back, walk
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.evaluate.measure import EvaluateConfig, evaluate
 from warpgarment.training.tables.errors import DataLacks, OptionMissing
+from warpgarment.training.tables.long_rollout import Limits, extended, figures, judged, there_and_back, walk
 from warpgarment.training.tables.options import TableOptions
 
 

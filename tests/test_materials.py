@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from cloth_scenes import stretch
 
+from warpgarment.training.generate.quality import Limits
 from warpgarment.training.materials import DLAYERS, RANGES, Material, from_blender, sampled_material, to_blender
-from warpgarment.training.quality import Limits
 from warpgarment.training.teachers import Cloth, ClothScene
 from warpgarment.training.teachers.checks import hanging_sheet
-from warpgarment.training.teachers.newton_vbd import NewtonTeacher
+from warpgarment.training.teachers.newton.teacher import NewtonTeacher
 
 NUMBERS = {"mass": 0.3, "tension": 40.0, "compression": 40.0, "shear": 25.0, "bending": 20.0, "friction": 55.0}
 

@@ -17,9 +17,10 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.objects.body import BodyMotion
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training import evaluate, model_card, model_card_pictures
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.model_card import CardError, ModelCardConfig, chosen, largest, read_log, write_card
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.evaluate import measure as evaluate
+from warpgarment.training.evaluate import model_card, model_card_pictures
+from warpgarment.training.evaluate.model_card import CardError, ModelCardConfig, chosen, largest, read_log, write_card
 
 
 def row(name, network, skinned, start="cold", **entries):

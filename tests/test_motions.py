@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
-from warpgarment.training import skeleton
-from warpgarment.training.amass import read_amass
-from warpgarment.training.bvh import read_bvh
-from warpgarment.training.clips import Clip, resampled
-from warpgarment.training.motions import clip_frames, jumps, list_clips, read_clip, retarget
-from warpgarment.training.procedural import KINDS, procedural
+from warpgarment.training.bodies import skeleton
+from warpgarment.training.motions.amass import read_amass
+from warpgarment.training.motions.bvh import read_bvh
+from warpgarment.training.motions.clip import Clip, resampled
+from warpgarment.training.motions.clips import clip_frames, jumps, list_clips, read_clip, retarget
+from warpgarment.training.motions.procedural import KINDS, procedural
 
 ARM = [("Hips", None, (0.0, 0.0, 0.0)), ("Spine", "Hips", (0.0, 2.0, 0.0)), ("Head", "Spine", (0.0, 3.0, 0.0))]
 

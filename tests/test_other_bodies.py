@@ -11,11 +11,12 @@ import trimesh
 from data_bodies import rest_body
 
 from warpgarment.errors import MissingExtra
-from warpgarment.training import other_bodies, skeleton
-from warpgarment.training.bodies import PHENOTYPES, RestBody, bundled_body, sampled_phenotype
-from warpgarment.training.clearance import resolve_clearance
-from warpgarment.training.garments import Pattern, make_garment
-from warpgarment.training.procedural import procedural
+from warpgarment.training.bodies import other as other_bodies
+from warpgarment.training.bodies import skeleton
+from warpgarment.training.bodies.anny import PHENOTYPES, RestBody, bundled_body, sampled_phenotype
+from warpgarment.training.bodies.limb_clearance import resolve_clearance
+from warpgarment.training.garments.make import Pattern, make_garment
+from warpgarment.training.motions.procedural import procedural
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ import pytest
 from data_bodies import rest_body
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training import outfits
-from warpgarment.training.garments import CATEGORIES
-from warpgarment.training.outfits import (
+from warpgarment.training.garments import outfits
+from warpgarment.training.garments.make import CATEGORIES
+from warpgarment.training.garments.outfits import (
     OutfitError,
     OutfitPattern,
     layers_disjoint,

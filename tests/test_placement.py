@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warpgarment.training import placement
-from warpgarment.training.generate import prepare
-from warpgarment.training.recipes import GenerateConfig, plan_sequence
+from warpgarment.training.generate import placement
+from warpgarment.training.generate.recipes import GenerateConfig, plan_sequence
+from warpgarment.training.generate.run import prepare
 
 
 @pytest.fixture(scope="module")

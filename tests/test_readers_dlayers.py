@@ -18,7 +18,7 @@ from warpgarment.training.materials import Material
 from warpgarment.training.readers import PickleRefused, detect, read_dlayers, read_recording
 from warpgarment.training.readers.blender_cloth import blender_material, mass_ratio, wind_speed
 from warpgarment.training.teachers import Cloth, ClothScene
-from warpgarment.training.teachers.blender_units import BlenderSettings, blender_numbers
+from warpgarment.training.teachers.blender.units import BlenderSettings, blender_numbers
 
 FIRST, LAST = 2, 8  # of the clip's ten frames
 FRAMES = LAST - FIRST

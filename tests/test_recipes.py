@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from data_bodies import write_bvh
 
-from warpgarment.training.recipes import (
+from warpgarment.training.generate.recipes import (
     ConfigurationError,
     GenerateConfig,
     plan_sequence,

@@ -8,9 +8,9 @@ import pytest
 from data_bodies import rest_body
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.garments import CATEGORIES, Pattern, make_garment
-from warpgarment.training.mesh_cutting import boundary_loops
-from warpgarment.training.seams import Seam, Seams, cut_seams, parted, sampled_seams
+from warpgarment.training.garments.make import CATEGORIES, Pattern, make_garment
+from warpgarment.training.garments.seams import Seam, Seams, cut_seams, parted, sampled_seams
+from warpgarment.training.meshes.cutting import boundary_loops
 
 ROWS, COLUMNS, RADIUS, HEIGHT = 20, 40, 0.3, 1.0
 

@@ -19,8 +19,8 @@ from warpgarment import cli
 from warpgarment.nn import checkpoint
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.dataset import Sequence, list_sequences
-from warpgarment.training.evaluate import EvaluateConfig, evaluate
+from warpgarment.training.data.sequence import Sequence, list_sequences
+from warpgarment.training.evaluate.measure import EvaluateConfig, evaluate
 from warpgarment.training.tables import figure7, meshing, protocol, report
 from warpgarment.training.tables.errors import DataLacks, OptionMissing
 from warpgarment.training.tables.options import TableOptions

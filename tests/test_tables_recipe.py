@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import synthetic_sequences
 
-from warpgarment.training.evaluate import EvaluateConfig, evaluate
-from warpgarment.training.run import NonFiniteLoss
+from warpgarment.training.evaluate.measure import EvaluateConfig, evaluate
 from warpgarment.training.tables import compare, recipe, report, runs, settings, variants
 from warpgarment.training.tables.options import TableOptions
-from warpgarment.training.train_config import TrainConfig
-from warpgarment.training.unroll import UnrollConfig
+from warpgarment.training.train.config import TrainConfig
+from warpgarment.training.train.run import NonFiniteLoss
+from warpgarment.training.train.unrolled_objective import UnrollConfig
 
 SHAPE = ("dropout=0.0", "embedding=16", "layers=1", "feed_forward=16", "heads=2", "manifold_heads=1")
 QUICK = (

@@ -17,13 +17,13 @@ from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training import train
-from warpgarment.training.dataset import Sequence, list_sequences
-from warpgarment.training.evaluate import evaluate
+from warpgarment.training.data.sequence import Sequence, list_sequences
+from warpgarment.training.evaluate.measure import evaluate
 from warpgarment.training.rollouts import predict
 from warpgarment.training.tables import compare, runs, settings, variants
 from warpgarment.training.tables.errors import OptionMissing
-from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.train import start as train
+from warpgarment.training.train.config import TrainConfig
 
 
 @pytest.fixture(scope="module")

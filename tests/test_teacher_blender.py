@@ -19,9 +19,9 @@ from warpgarment.io.pc2 import read_pc2
 from warpgarment.objects.garment import Garment
 from warpgarment.training.materials import Material, to_blender
 from warpgarment.training.teachers import Cloth, ClothScene, TeacherError, make_teacher
-from warpgarment.training.teachers import blender_environment as environment
-from warpgarment.training.teachers.blender import BlenderTeacher, write_scene
-from warpgarment.training.teachers.blender_units import (
+from warpgarment.training.teachers.blender import environment
+from warpgarment.training.teachers.blender.teacher import BlenderTeacher, write_scene
+from warpgarment.training.teachers.blender.units import (
     BlenderSettings,
     blender_numbers,
     pin_path,
@@ -253,7 +253,7 @@ def test_a_missing_environment_names_the_command(monkeypatch, tmp_path):
     """If this fails, a user without Blender does not learn how to get it."""
     monkeypatch.delenv(environment.VARIABLE, raising=False)
     monkeypatch.setenv("WARPGARMENT_CACHE", str(tmp_path))
-    with pytest.raises(TeacherError, match=r"python -m warpgarment.training.teachers.blender_environment"):
+    with pytest.raises(TeacherError, match=r"python -m warpgarment.training.teachers.blender.environment"):
         make_teacher("blender")
     monkeypatch.setenv(environment.VARIABLE, str(tmp_path / "nowhere"))
     with pytest.raises(TeacherError, match="nowhere"):
@@ -305,7 +305,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
 
 def test_the_script_needs_nothing_of_this_package():
     """If this fails, the script cannot run in Blender's environment, or Blender's licence comes into this process."""
-    tree = ast.parse(Path(environment.__file__).with_name("blender_script.py").read_text())
+    tree = ast.parse(Path(environment.__file__).with_name("script.py").read_text())
     imports = [n for n in ast.walk(tree) if isinstance(n, (ast.Import, ast.ImportFrom))]
     names = {alias.name for n in imports if isinstance(n, ast.Import) for alias in n.names}
     names |= {str(n.module) for n in imports if isinstance(n, ast.ImportFrom)}

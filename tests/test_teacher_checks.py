@@ -20,7 +20,7 @@ from warpgarment.training.teachers.checks import (
     run_checks,
     vertex_areas,
 )
-from warpgarment.training.teachers.newton_vbd import CONVERGED, NewtonTeacher
+from warpgarment.training.teachers.newton.teacher import CONVERGED, NewtonTeacher
 
 
 class Known:

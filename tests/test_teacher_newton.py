@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.objects.garment import Garment
 from warpgarment.training.teachers import ClothScene, TeacherError, make_teacher
-from warpgarment.training.teachers._newton_model import Worlds
-from warpgarment.training.teachers._scenes import MovingFrame
-from warpgarment.training.teachers.newton_vbd import NewtonSettings, NewtonTeacher
+from warpgarment.training.teachers.newton.teacher import NewtonSettings, NewtonTeacher
+from warpgarment.training.teachers.newton.worlds import Worlds
+from warpgarment.training.teachers.scenes import MovingFrame
 
 FAST = NewtonSettings(substeps=5, iterations=4)
 place = Worlds.place

@@ -15,10 +15,10 @@ import torch
 from training_runs import SHAPE, config_for, entries_of, losses_of
 
 from warpgarment.nn import checkpoint
-from warpgarment.training import train
-from warpgarment.training.objective import Objective
-from warpgarment.training.pushforward import Pool, PushforwardConfig
-from warpgarment.training.samples import SampleBuilder
+from warpgarment.training.samples.pushforward import Pool, PushforwardConfig
+from warpgarment.training.samples.single_step import SampleBuilder
+from warpgarment.training.train import start as train
+from warpgarment.training.train.objective import Objective
 
 QUIET = PushforwardConfig(share=0.0)
 KILLED = """

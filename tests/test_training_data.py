@@ -11,11 +11,12 @@ import synthetic_sequences
 from training_runs import config_for, losses_of
 
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.training import interactions, train
-from warpgarment.training.dataset import Sequence
+from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.distributed import Group
-from warpgarment.training.pushforward import PushforwardConfig
-from warpgarment.training.training_set import load_sequences, load_validation, report
+from warpgarment.training.samples import interactions
+from warpgarment.training.samples.pushforward import PushforwardConfig
+from warpgarment.training.train import start as train
+from warpgarment.training.train.training_set import load_sequences, load_validation, report
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2)
 

@@ -12,9 +12,9 @@ import synthetic_sequences
 from training_runs import SHAPE, config_for, losses_of
 
 from warpgarment.nn import checkpoint
-from warpgarment.training import train
 from warpgarment.training.distributed import FRESH, Group, GroupError
-from warpgarment.training.noise import NoiseConfig
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.train import start as train
 
 SETTINGS = {"overrides": (*SHAPE, "dropout=0.0"), "noise": NoiseConfig(), "log_every": 1}
 WORKER = """

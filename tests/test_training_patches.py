@@ -16,15 +16,16 @@ from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.nn.parametrisation import NetworkOutput
 from warpgarment.nn.patches.layout import garment_patches, patch_layout
 from warpgarment.nn.patches.network import PatchTransformer
-from warpgarment.training import interactions, train
-from warpgarment.training.augmentation import Augmentation
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.losses import LossConfig, loss
-from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.pushforward import Pool
-from warpgarment.training.samples import SampleBuilder
-from warpgarment.training.sequence_data import SequenceData
-from warpgarment.training.unroll import UnrollConfig
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.samples import interactions
+from warpgarment.training.samples.augmentation import Augmentation
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.pushforward import Pool
+from warpgarment.training.samples.recorded import SequenceData
+from warpgarment.training.samples.single_step import SampleBuilder
+from warpgarment.training.train import start as train
+from warpgarment.training.train.losses import LossConfig, loss
+from warpgarment.training.train.unrolled_objective import UnrollConfig
 
 SHAPE = (
     "embedding=16", "layers=1", "feed_forward=16", "heads=2", "geodesic_radius=0.2", "face_embedding=16",

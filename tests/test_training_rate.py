@@ -11,7 +11,7 @@ from warpgarment.kernels.features.face import FEATURES
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.flops import forward_flops, peak_of, step_flops
-from warpgarment.training.rate import Rate, spelt
+from warpgarment.training.train.rate import Rate, spelt
 
 
 @pytest.mark.parametrize("changes", [{}, {"manifold_heads": 0, "heads": 2}, {"manifold_heads": 4, "norm_first": False}])
@@ -47,7 +47,7 @@ def test_peaks_belong_to_names():
 def test_rate_counts_running_time_only(monkeypatch):
     """Validation and saving count as training, or several devices as one. By hand."""
     now = [100.0]
-    monkeypatch.setattr("warpgarment.training.rate.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("warpgarment.training.train.rate.time.monotonic", lambda: now[0])
     rate = Rate(torch.device("cpu"), "bfloat16", processes=2)
     rate.peak = 10e12
     for seconds, counts in ((2.0, True), (50.0, False), (2.0, True)):

@@ -18,13 +18,13 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.nn.network import NormalisedOutput, rotate_output
 from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
-from warpgarment.training import interactions
-from warpgarment.training.augmentation import Augmentation, mirror
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.losses import LossConfig, loss
-from warpgarment.training.noise import NoiseBasis, NoiseConfig
-from warpgarment.training.samples import SampleBuilder
-from warpgarment.training.sequence_data import SequenceData
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.samples import interactions
+from warpgarment.training.samples.augmentation import Augmentation, mirror
+from warpgarment.training.samples.noise import NoiseBasis, NoiseConfig
+from warpgarment.training.samples.recorded import SequenceData
+from warpgarment.training.samples.single_step import SampleBuilder
+from warpgarment.training.train.losses import LossConfig, loss
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.1, geodesic_radius=0.2)
 QUIET = NoiseConfig(position=0.0, offset=0.0)

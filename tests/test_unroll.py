@@ -17,19 +17,21 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.sim import differentiable
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training import interactions, train, unroll
-from warpgarment.training.augmentation import Augmentation
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.losses import LossConfig
-from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.objective import Objective
-from warpgarment.training.pushforward import PushforwardConfig
+from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
-from warpgarment.training.samples import SampleBuilder
-from warpgarment.training.sequence_data import SequenceData
-from warpgarment.training.statistics import statistics
-from warpgarment.training.unroll import UnrollConfig, UnrolledObjective
-from warpgarment.training.unroll_samples import UnrolledBuilder
+from warpgarment.training.samples import interactions
+from warpgarment.training.samples.augmentation import Augmentation
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.pushforward import PushforwardConfig
+from warpgarment.training.samples.recorded import SequenceData
+from warpgarment.training.samples.single_step import SampleBuilder
+from warpgarment.training.samples.statistics import statistics
+from warpgarment.training.samples.unrolled import UnrolledBuilder
+from warpgarment.training.train import start as train
+from warpgarment.training.train import unrolled_objective as unroll
+from warpgarment.training.train.losses import LossConfig
+from warpgarment.training.train.objective import Objective
+from warpgarment.training.train.unrolled_objective import UnrollConfig, UnrolledObjective
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.0, geodesic_radius=0.2)
 QUIET = NoiseConfig(position=0.0, offset=0.0)

@@ -12,9 +12,9 @@ import pytest
 import synthetic_sequences
 
 from warpgarment import cli
-from warpgarment.training.dataset import write_sequence
-from warpgarment.training.set_manifest import write_set_manifest
-from warpgarment.training.verify import verify
+from warpgarment.training.data.sequence import write_sequence
+from warpgarment.training.data.set_manifest import write_set_manifest
+from warpgarment.training.data.verify import verify
 
 CONFIGURATION = {"recipe": "cloth3d", "seed": 0, "held_out": ["skirt"]}
 

@@ -10,7 +10,7 @@ from poison import poison_outputs
 from reference import wind as reference
 
 from warpgarment.kernels.wind import air_forces
-from warpgarment.training.wind import Wind, sampled_wind, speed_of_strength, strength_of_speed
+from warpgarment.training.generate.wind import Wind, sampled_wind, speed_of_strength, strength_of_speed
 
 GARMENTS = meshes.garments()
 

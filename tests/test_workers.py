@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from warpgarment.training.workers import spread
+from warpgarment.training.generate.workers import spread
 
 
 def work(item: int) -> int:

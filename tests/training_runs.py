@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.pushforward import PushforwardConfig
-from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.pushforward import PushforwardConfig
+from warpgarment.training.train.config import TrainConfig
 
 SHAPE = ("embedding=16", "layers=1", "feed_forward=16", "heads=2", "geodesic_radius=0.2")
 

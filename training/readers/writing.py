@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.training.dataset import write_sequence
+from warpgarment.training.data.sequence import write_sequence
 
 from .recording import Recording
 

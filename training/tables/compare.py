@@ -8,9 +8,9 @@ from typing import Any, Literal, cast
 
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.run import NonFiniteLoss
-from warpgarment.training.train_config import TrainConfig
-from warpgarment.training.training_set import folders_of
+from warpgarment.training.train.config import TrainConfig
+from warpgarment.training.train.run import NonFiniteLoss
+from warpgarment.training.train.training_set import folders_of
 
 from . import recipe, variants
 from .errors import DataLacks, OptionMissing

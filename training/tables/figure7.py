@@ -13,9 +13,9 @@ from warpgarment.nn import checkpoint
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.dataset import Sequence
+from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
-from warpgarment.training.training_set import folders_of
+from warpgarment.training.train.training_set import folders_of
 from warpgarment.view import draw
 
 from .errors import DataLacks, OptionMissing

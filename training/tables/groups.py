@@ -9,10 +9,10 @@ from typing import Any
 
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.dataset import read_manifest
-from warpgarment.training.recipes import TRAINING_CUTS
-from warpgarment.training.set_manifest import read_set_manifest
-from warpgarment.training.training_set import folders_of
+from warpgarment.training.data.sequence import read_manifest
+from warpgarment.training.data.set_manifest import read_set_manifest
+from warpgarment.training.generate.recipes import TRAINING_CUTS
+from warpgarment.training.train.training_set import folders_of
 
 from .errors import DataLacks, OptionMissing
 from .pictures import Keeper, bars, results_file, rollouts

@@ -11,13 +11,13 @@ from tqdm import tqdm
 from warpgarment import demo
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.dataset import Sequence
-from warpgarment.training.long_rollout import STILL, Limits, extended, figures, judged, settled, vertex_areas, walk
+from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
-from warpgarment.training.training_set import folders_of
+from warpgarment.training.train.training_set import folders_of
 from warpgarment.view import draw
 
 from .errors import DataLacks, OptionMissing
+from .long_rollout import STILL, Limits, extended, figures, judged, settled, vertex_areas, walk
 from .pictures import axes_of, save
 from .protocol import STARTS, Known, evenly
 from .report import grid, publish

@@ -12,7 +12,7 @@ import igl
 import numpy as np
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.mesh_cutting import remeshed
+from warpgarment.training.meshes.cutting import remeshed
 
 
 class NotRemeshable(ValueError):

@@ -22,9 +22,9 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.baselines import rigid, skinned
-from warpgarment.training.dataset import Sequence
+from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
-from warpgarment.training.training_set import reason_of
+from warpgarment.training.train.training_set import reason_of
 
 METHODS = ("network", "skinned", "rigid")
 STARTS = ("warm", "cold")

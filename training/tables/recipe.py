@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.train.config import TrainConfig
 
 from .protocol import STARTS
 from .report import grid

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from warpgarment.io.atomic import atomic_file
-from warpgarment.training.set_manifest import package_versions
+from warpgarment.training.data.set_manifest import package_versions
 
 from .options import RESULTS
 from .protocol import FIGURES, STARTS, cells, plain, skipped_lines

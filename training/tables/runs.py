@@ -17,10 +17,10 @@ from typing import Any
 from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
 from warpgarment.nn import checkpoint
-from warpgarment.training.dataset import read_manifest
-from warpgarment.training.train import train
-from warpgarment.training.train_config import TrainConfig
-from warpgarment.training.training_set import folders_of
+from warpgarment.training.data.sequence import read_manifest
+from warpgarment.training.train.config import TrainConfig
+from warpgarment.training.train.start import train
+from warpgarment.training.train.training_set import folders_of
 
 from .settings import described, differences
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from typing import Any, TypeVar
 
-from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.train.config import TrainConfig
 
 OWN_OPTIONS = ("data", "out", "network", "overrides", "steps", "time_limit", "seed", "resume", "device", "threads")
 HOW = ("data", "out", "cache", "resume", "device", "threads", "ahead")  # where and how fast, not what comes out

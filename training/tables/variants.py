@@ -12,7 +12,7 @@ import itertools
 from dataclasses import dataclass, replace
 
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.training.train_config import TrainConfig
+from warpgarment.training.train.config import TrainConfig
 
 from .settings import with_settings
 

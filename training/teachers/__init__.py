@@ -116,11 +116,11 @@ def make_teacher(name: Literal["newton", "blender"], device: str | None = "cpu")
         TeacherError: Blender's environment has not been made.
     """
     if name == "newton":
-        from .newton_vbd import NewtonSettings, NewtonTeacher
+        from warpgarment.training.teachers.newton.teacher import NewtonSettings, NewtonTeacher
 
         return NewtonTeacher(NewtonSettings(layer_friction=LAYER_FRICTION), device=device)
     if name == "blender":
-        from .blender import BlenderTeacher
+        from warpgarment.training.teachers.blender.teacher import BlenderTeacher
 
         return BlenderTeacher()
     raise ValueError(f"unknown teacher {name!r}; there are {', '.join(TEACHERS)}")

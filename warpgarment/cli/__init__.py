@@ -46,12 +46,15 @@ VERBS = {
     ),
     "simulate": Verb("cli.simulate", "Simulate", "run", "Dress a moving body: garment file, body motion, output file."),
     "generate": Verb(
-        "training.generate", "GenerateConfig", "generate", "Simulate training sequences with a physics teacher."
+        "training.generate.run", "GenerateConfig", "generate", "Simulate training sequences with a physics teacher."
     ),
     "train": Verb("training.train", "TrainConfig", "train", "Train a network on sequences."),
-    "dataset": Verb("cli.dataset", "Dataset", "run", "Check a data set, write a page about it, or import others."),
+    "dataset": Verb("training.cli", "Dataset", "run", "Check a data set, write a page about it, or import others."),
     "evaluate": Verb(
-        "training.evaluate", "EvaluateConfig", "evaluate", "Roll a network out on test sequences and measure it."
+        "training.evaluate.measure",
+        "EvaluateConfig",
+        "evaluate",
+        "Roll a network out on test sequences and measure it.",
     ),
     "bench": Verb("cli.bench", "Bench", "run", "Time a rollout by stage on this machine."),
     "view": Verb("cli.view", "View", "run", "Look at a motion, or draw it to a PNG or MP4 without a display."),

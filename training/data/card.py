@@ -1,0 +1,180 @@
+"""A page about a data set: `warpgarment dataset card DIR` writes DIR/card.md and its pictures, DIR/card/*.png.
+
+Everything on it is read from the set itself: what it is and how it was made, counts by split and category, motions,
+body shapes, quality figures, rejections, materials and wind where there are any, pictures, licences and credits.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgarment.io.atomic import atomic_file, atomic_folder
+
+from .card_page import page
+from .card_pictures import bars, contact_sheet, histograms
+from .layout import SPLITS
+from .sequence import list_sequences, read_manifest
+from .set_manifest import read_set_manifest
+
+PICTURES = 12
+Values = dict[str, dict[str, list[float]]]  # quantity -> split -> one value a sequence or garment
+_FIGURES = {  # of the quality gate: heading, factor
+    "penetration": ("deepest vertex [mm]", 1e3),
+    "inside": ("vertices inside the body [%]", 1e2),
+    "stretch_mean": ("mean stretch [%]", 1e2),
+    "stretch_p99": ("99th percentile of stretch [%]", 1e2),
+    "stretch_max": ("largest stretch [%]", 1e2),
+    "step_max": ("largest step [mm/frame]", 1e3),
+}
+_MATERIALS = {
+    "density": ("density [kg/m²]", 1.0),
+    "stretch": ("stretch stiffness [N/m]", 1.0),
+    "shear": ("shear stiffness [N/m]", 1.0),
+    "bend": ("bending stiffness [mN m]", 1e3),
+    "damping": ("damping [µs]", 1e6),
+    "friction": ("friction", 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the page is about: manifests of good and of rejected sequences, and their folders."""
+
+    root: Path
+    common: dict[str, Any]
+    good: dict[Path, dict[str, Any]]
+    rejected: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, root: Path) -> Facts:
+        """Reads the manifests of a set."""
+        manifests = {folder: read_manifest(folder) for folder in list_sequences(root, status=None)}
+        good = {folder: m for folder, m in manifests.items() if m.get("status") == "good"}
+        rejected = [m for m in manifests.values() if m.get("status") == "rejected"]
+        rejected += [attempt for m in manifests.values() for attempt in m.get("rejected_attempts", [])]
+        return cls(root, read_set_manifest(root) or {}, good, rejected)
+
+
+class EmptyDataset(ValueError):
+    """There is no good sequence to write about."""
+
+
+def write_card(
+    root: str | Path, out: str | Path | None = None, *, pictures: int = PICTURES, size: tuple[int, int] = (240, 320)
+) -> Path:
+    """Writes the page.
+
+    Args:
+        root: The data set's folder.
+        out: Folder for `card.md` and `card/`; the data set's own by default.
+        pictures: Sequences on the contact sheet.
+        size: Width and height of each picture in pixels.
+
+    Returns:
+        The page.
+
+    Raises:
+        FileNotFoundError: There is no such folder.
+        EmptyDataset: It holds no good sequence.
+        MissingExtra: Pictures need `pip install "warpgarment[view]"`.
+    """
+    root = Path(root)
+    out = root if out is None else Path(out)
+    facts = Facts.of(root)
+    if not facts.good:
+        raise EmptyDataset(f"{root} holds no good sequence. Make some with `warpgarment generate --out {root}`.")
+    with atomic_folder(out / "card", "*.png") as folder:
+        contact_sheet(folder / "sequences.png", chosen(facts.good, pictures), size=size)
+        drawn = {"bodies": bodies(facts), "figures": figures(facts), "materials": materials(facts), "wind": wind(facts)}
+        for name, values in drawn.items():
+            if values:
+                histograms(folder / f"{name}.png", values)
+        reasons = Counter(kind_of_reason(str(m.get("reason"))) for m in facts.rejected)
+        if reasons:
+            bars(folder / "rejections.png", dict(reasons.most_common()), "attempts rejected, by reason")
+    with atomic_file(out / "card.md") as temporary:
+        temporary.write_text(page(facts, drawn, reasons), "utf-8")
+    return out / "card.md"
+
+
+def chosen(good: Mapping[Path, Mapping[str, Any]], count: int) -> list[Path]:
+    """Sequences for the contact sheet: categories in turn, evenly spread within each."""
+    of: dict[str, list[Path]] = defaultdict(list)
+    for folder, manifest in good.items():
+        of[str(manifest.get("category"))].append(folder)
+    quota = dict.fromkeys(of, 0)
+    wanted = min(count, len(good))
+    for category in itertools.cycle(of):
+        if sum(quota.values()) == wanted:
+            break
+        quota[category] += quota[category] < len(of[category])
+    spread = {c: [group[(i * len(group)) // quota[c]] for i in range(quota[c])] for c, group in of.items()}
+    turns = itertools.zip_longest(*spread.values())
+    return [folder for turn in turns for folder in turn if folder is not None]
+
+
+def bodies(facts: Facts) -> Values:
+    """Shape parameters by split."""
+    shapes = [(m, m["body"]) for m in facts.good.values() if isinstance(m.get("body"), dict)]
+    return _by_split((m, key, value) for m, shape in shapes for key, value in shape.items())
+
+
+def figures(facts: Facts) -> Values:
+    """Quality figures by split; those of layers are shares."""
+    rows: list[tuple[Mapping[str, Any], str, Any]] = []
+    for manifest in facts.good.values():
+        values = manifest.get("figures", {})
+        rows += [(manifest, heading, values[key] * by) for key, (heading, by) in _FIGURES.items() if key in values]
+        rows += [(manifest, key.replace("_", " "), value) for key, value in values.items() if key.startswith("layer")]
+    return _by_split(rows)
+
+
+def materials(facts: Facts) -> Values:
+    """Cloth parameters of every garment, by split; nothing where all are the same."""
+    rows: list[tuple[Mapping[str, Any], str, Any]] = []
+    for manifest in facts.good.values():
+        for garment in manifest.get("garments") or []:
+            for key, value in garment.get("material", {}).items():
+                heading, by = _MATERIALS.get(key, (key, 1.0))
+                rows += [(manifest, heading, value * by)] if _is_number(value) else []
+    values = _by_split(rows)
+    return values if any(len({x for v in splits.values() for x in v}) > 1 for splits in values.values()) else {}
+
+
+def wind(facts: Facts) -> Values:
+    """Mean and largest speed of the air in each sequence that has any, by split."""
+    rows: list[tuple[Mapping[str, Any], str, Any]] = []
+    for folder, manifest in facts.good.items():
+        if (folder / "wind.npy").exists():
+            speed = np.linalg.norm(np.load(folder / "wind.npy", allow_pickle=False), axis=1)
+            rows += [(manifest, "mean wind [m/s]", float(speed.mean())), (manifest, "gusts [m/s]", float(speed.max()))]
+    return _by_split(rows)
+
+
+def _by_split(rows: Iterable[tuple[Mapping[str, Any], str, Any]]) -> Values:
+    values: Values = {}
+    for manifest, key, value in rows:
+        if _is_number(value):
+            splits = values.setdefault(key, {})
+            splits.setdefault(str(manifest.get("split")), []).append(float(value))
+    return {key: {s: splits[s] for s in SPLITS if s in splits} for key, splits in values.items()}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def kind_of_reason(reason: str) -> str:
+    """What a reason is about, without its numbers: "frame 54: penetration 11.5 mm is over 10 mm" -> "penetration"."""
+    text = re.sub(r"^frame \d+: ", "", reason)
+    if gate := re.match(r"(\w+) [-\d.]+ ?(?:%|mm) is over", text):
+        return gate[1]
+    return re.sub(r"\d[\d.,]*", "N", re.split(r"[.:;(]\s", text)[0])[:60].strip()

@@ -1,0 +1,292 @@
+"""Is a data set whole, unchanged, and split as it should be? `warpgarment dataset verify DIR`
+
+Every sequence: the manifest says what it must, every file has its checksum, arrays fit each other, values are finite,
+the rest mesh is one that a garment can have. The set: no two sequences of one number, none missing of those planned,
+none of another seed, no clip (or clip of the same performance) and no garment both trained and tested on, no held-out
+category trained on, nothing unfinished left behind.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgarment.errors import MeshError
+from warpgarment.view.report import table
+
+from .layout import SPLITS
+from .sequence import MANIFEST, Sequence, read_manifest
+from .set_manifest import planned_numbers, read_set_manifest
+
+NOT_SEQUENCES = ("card",)  # folders that a set may hold besides
+_HELD_OUT_BY_CATEGORY = ("cloth3d",)  # recipes; outfits and cuts are split otherwise
+
+
+class VerificationFailed(ValueError):
+    """Something is wrong with a data set."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong, and where: a sequence's folder, or a file or folder of the set."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What is known about a sequence.
+
+    Attributes:
+        name: Its folder.
+        manifest: Empty where it cannot be read.
+        size: Bytes on disk.
+        garments: A fingerprint of the rest mesh of each garment; empty where it could not be read.
+        problems: What is wrong with it.
+    """
+
+    name: str
+    manifest: dict[str, Any]
+    size: int
+    garments: tuple[str, ...]
+    problems: tuple[Problem, ...]
+
+
+@dataclass
+class Report:
+    """Result of :func:`verify`.
+
+    Attributes:
+        root: The folder's name.
+        sequences, rejected, frames, size: Good and rejected sequences, frames of the good ones, bytes of the set.
+        rejected_attempts: How often a sequence was rejected and drawn anew.
+        splits: Good sequences, frames, and sequences by category, of each split.
+        problems: Everything that is wrong.
+    """
+
+    root: str
+    sequences: int = 0
+    rejected: int = 0
+    rejected_attempts: int = 0
+    frames: int = 0
+    size: int = 0
+    splits: dict[str, dict[str, Any]] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        categories = sorted({c for split in self.splits.values() for c in split["categories"]})
+        rows = [
+            [name, split["sequences"], f"{split['frames']:,}", *(split["categories"].get(c, "-") for c in categories)]
+            for name, split in self.splits.items()
+        ]
+        lines = [
+            table(["split", "sequences", "frames", *categories], rows) if rows else "no sequence",
+            f"{self.sequences:,} sequences, {self.frames:,} frames, {self.size / 1e6:,.1f} MB; {self.rejected:,} "
+            f"rejected, {self.rejected_attempts:,} attempts drawn anew",
+            *(f"{p.where}: {p.what}" for p in self.problems[:20]),
+            *([f"and {len(self.problems) - 20:,} more problems"] if len(self.problems) > 20 else []),
+        ]
+        return "\n".join(lines)
+
+
+def verify(root: str | Path) -> Report:
+    """Checks a data set.
+
+    Raises:
+        FileNotFoundError: There is no such folder.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise FileNotFoundError(f"no data set at {root}")
+    report = Report(root.resolve().name)
+    entries = []
+    for path in sorted(p for p in root.iterdir() if p.is_dir() and p.name not in NOT_SEQUENCES):
+        if path.name.startswith("."):
+            report.problems.append(Problem(path.name, "unfinished. Remove it, unless a sequence is being written."))
+        else:
+            entries.append(check_sequence(path))
+    report.problems += [p for entry in entries for p in entry.problems]
+    try:
+        manifest = read_set_manifest(root) or {}
+    except MeshError as error:
+        manifest = {}
+        report.problems.append(Problem("set.json", str(error)))
+    report.problems += [*_numbers(entries, manifest), *_splits(entries), *_held_out(entries, manifest)]
+    _count(report, entries)
+    if not entries:
+        report.problems.append(Problem(report.root, "holds no sequence. Make some with `warpgarment generate`."))
+    return report
+
+
+def check_sequence(folder: Path) -> Entry:
+    """Reads one sequence completely and says what is wrong with it."""
+    try:
+        size = sum(p.stat().st_size for p in folder.iterdir() if p.is_file())
+        manifest = read_manifest(folder)
+    except (MeshError, OSError) as error:
+        return Entry(folder.name, {}, 0, (), (Problem(folder.name, str(error)),))
+    problems = _manifest_problems(manifest)
+    if problems:  # nothing it says can be counted on
+        return Entry(folder.name, {}, size, (), tuple(Problem(folder.name, p) for p in problems))
+    problems = _file_problems(folder, manifest)
+    garments: tuple[str, ...] = ()
+    if not problems and manifest["checksums"]:
+        try:
+            garments = _content(Sequence.load(folder))
+        except (ValueError, OSError) as error:
+            problems.append(str(error).removeprefix(f"{folder.name}: "))
+    return Entry(folder.name, manifest, size, garments, tuple(Problem(folder.name, p) for p in problems))
+
+
+def _manifest_problems(manifest: dict[str, Any]) -> list[str]:
+    """What a manifest must say, and does not."""
+
+    def text(value: Any) -> bool:
+        return isinstance(value, str) and bool(value)
+
+    def number(value: Any) -> bool:
+        return isinstance(value, (int, float)) and math.isfinite(value)
+
+    rejected = manifest.get("status") == "rejected"
+    needed: dict[str, Callable[[Any], bool]] = {
+        "status": lambda v: v in ("good", "rejected"),
+        "split": lambda v: v in SPLITS,
+        "garment": text,
+        "motion": text,
+        "fps": lambda v: number(v) and v > 0,
+        "frames": lambda v: isinstance(v, int) and v >= (0 if rejected else 1),
+        "checksums": lambda v: isinstance(v, dict) and (rejected or bool(v)),
+    }
+    if rejected:
+        needed["reason"] = text
+    optional: dict[str, Callable[[Any], bool]] = {
+        "number": lambda v: isinstance(v, int),
+        "garments": lambda v: isinstance(v, list) and all(isinstance(g, dict) for g in v),
+        "rejected_attempts": lambda v: isinstance(v, list),
+    }
+    problems = [f"{MANIFEST} does not say {key}" for key in needed if key not in manifest]
+    problems += [
+        f"{MANIFEST} says {manifest[key]!r} for {key}"
+        for key, fits in {**needed, **optional}.items()
+        if key in manifest and not fits(manifest[key])
+    ]
+    figures = manifest.get("figures", {})
+    if not isinstance(figures, dict):
+        problems.append(f"{MANIFEST} has figures that are not named")
+    elif bad := [key for key, value in figures.items() if not number(value)]:
+        problems.append(f"{MANIFEST} has {len(bad)} figures that are not finite (first: {bad[0]})")
+    return problems
+
+
+def _file_problems(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    """Files that are missing, changed, or not in the manifest."""
+    checksums = manifest["checksums"]
+    present = {path.name for path in folder.iterdir()} - {MANIFEST}
+    problems = [f"{name} is missing" for name in sorted(set(checksums) - present)]
+    problems += [f"{name} is not in {MANIFEST}" for name in sorted(present - set(checksums))]
+    for name in sorted(present & set(checksums)):
+        if hashlib.sha256((folder / name).read_bytes()).hexdigest() != checksums[name]:
+            problems.append(f"{name} does not have its checksum. Generate the sequence again.")
+    return problems
+
+
+def _content(sequence: Sequence) -> tuple[str, ...]:
+    """Fingerprints of the garments of a sequence whose arrays are sound.
+
+    Raises:
+        MeshError: They are not; says what is wrong.
+    """
+    if len(sequence) != sequence.manifest["frames"]:
+        raise MeshError(f"{len(sequence)} frames, {MANIFEST} says {sequence.manifest['frames']}")
+    arrays = sequence.arrays()
+    for name, array in arrays.items():
+        bad = ~np.isfinite(array)
+        if bad.any():
+            where = f" (first: frame {int(np.argwhere(bad)[0][0])})" if name in ("garment_vertices", "wind") else ""
+            raise MeshError(f"{name} holds {np.count_nonzero(bad):,} values that are not finite{where}")
+    sequence.body_in(slice(0, 1)).submesh(arrays["collider_faces"])
+    garment = sequence.garment
+    return tuple(
+        hashlib.sha256(
+            garment.vertices[layer.vertices].tobytes() + (garment.faces[layer.faces] - layer.vertices.start).tobytes()
+        ).hexdigest()
+        for layer in sequence.layers
+    )
+
+
+def _numbers(entries: list[Entry], manifest: dict[str, Any]) -> Iterable[Problem]:
+    """Sequences that are there twice, or missing, or of another seed."""
+    count = Counter(entry.manifest["number"] for entry in entries if "number" in entry.manifest)
+    for entry in entries:
+        if count[entry.manifest.get("number")] > 1:
+            yield Problem(entry.name, f"another sequence has the number {entry.manifest['number']} too")
+    missing = [number for number in planned_numbers(manifest) if number not in count]
+    if missing:
+        text = f"{len(missing):,} of {len(planned_numbers(manifest)):,} planned sequences are missing (first: number "
+        yield Problem("set.json", f"{text}{missing[0]}). Run `warpgarment generate` with the same options again.")
+    seed = manifest.get("configuration", {}).get("seed")
+    for entry in entries:
+        if seed is not None and entry.manifest.get("seed", seed) != seed:
+            yield Problem(entry.name, f"made with seed {entry.manifest['seed']}, the set with {seed}")
+
+
+def _splits(entries: list[Entry]) -> Iterable[Problem]:
+    """Clips and garments both trained and tested on."""
+    from warpgarment.training.generate.recipes import clip_group
+
+    clips: dict[str, str] = {}
+    garments: dict[str, str] = {}
+    for entry in _good(entries, "train"):
+        clips.setdefault(clip_group(str(entry.manifest.get("motion"))), entry.name)
+        garments |= {fingerprint: entry.name for fingerprint in entry.garments}
+    for entry in _good(entries, "test"):
+        motion = str(entry.manifest.get("motion"))
+        if not motion.startswith("procedural:") and clip_group(motion) in clips:
+            yield Problem(entry.name, f"tests on {motion}, of a performance trained on in {clips[clip_group(motion)]}")
+        if shared := [f for f in entry.garments if f in garments]:
+            yield Problem(entry.name, f"tests on a garment trained on in {garments[shared[0]]}")
+
+
+def _held_out(entries: list[Entry], manifest: dict[str, Any]) -> Iterable[Problem]:
+    """Categories trained on that are only to be tested on."""
+    configuration = manifest.get("configuration", {})
+    if configuration.get("recipe", "cloth3d") in _HELD_OUT_BY_CATEGORY:
+        for entry in _good(entries, "train"):
+            found = set(_categories(entry.manifest)) & set(configuration.get("held_out", []))
+            if found:
+                yield Problem(entry.name, f"trains on {', '.join(sorted(found))}, held out for tests")
+
+
+def _good(entries: list[Entry], split: str) -> list[Entry]:
+    return [e for e in entries if e.manifest.get("status") == "good" and e.manifest.get("split") == split]
+
+
+def _categories(manifest: dict[str, Any]) -> list[str]:
+    garments = manifest.get("garments") or [manifest]
+    return [str(garment.get("category", "")) for garment in garments]
+
+
+def _count(report: Report, entries: list[Entry]) -> None:
+    for split in SPLITS:
+        good = _good(entries, split)
+        if good:
+            categories = Counter(str(entry.manifest.get("category", "-")) for entry in good)
+            frames = sum(entry.manifest.get("frames", 0) for entry in good)
+            report.splits[split] = {"sequences": len(good), "frames": frames, "categories": dict(categories)}
+    report.sequences = sum(split["sequences"] for split in report.splits.values())
+    report.frames = sum(split["frames"] for split in report.splits.values())
+    report.rejected = sum(entry.manifest.get("status") == "rejected" for entry in entries)
+    report.rejected_attempts = sum(len(entry.manifest.get("rejected_attempts", [])) for entry in entries)
+    report.size = sum(entry.size for entry in entries)

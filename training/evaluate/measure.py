@@ -1,0 +1,227 @@
+"""Evaluation: a network's rollouts on the test sequences of a data folder, beside two baselines.
+
+    warpgarment evaluate --data sequences --network out/run/best.safetensors --out out/evaluation
+    warpgarment evaluate --table table1 --data sequences --steps 20000      # one of the paper's tables, see `tables`
+
+Every sequence is rolled out autoregressively twice: **warm**, from its first ten recorded frames, and **cold**, from
+the first alone. Only predicted frames count. Baselines start from the newest frame that the network saw. Pins are
+tied to the body's surface where they were in the first frame the method saw, as in any simulation; nothing recorded
+is used after the start.
+
+Writes `evaluation.json`, `evaluation.md` and `error_over_time.png`, each complete or not at all. The tables measure in
+the same way, with `measure`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from warpgarment.errors import MissingExtra
+from warpgarment.nn import checkpoint
+from warpgarment.sim.simulator import Simulator
+from warpgarment.training.tables.errors import OptionMissing
+from warpgarment.training.tables.options import TableName, TableOptions
+from warpgarment.training.tables.protocol import (
+    FIGURES,
+    METHODS,
+    STARTS,
+    cells,
+    evenly,
+    means,
+    measure,
+    plain,
+    skipped_lines,
+)
+from warpgarment.training.train.training_set import folders_of
+
+
+class NoTestData(ValueError):
+    """No sequence could be evaluated; the message says why."""
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Settings of an evaluation.
+
+    Attributes:
+        data: Folder of sequences.
+        out: Folder for the results; those of tables go to benchmarks/results by default.
+        network: Checkpoint file or folder, or the name of a network that ships. table1, table2 and recipe train
+            networks of their own: small, base or fast, the shape to start from ("default" is small).
+        split: Which sequences.
+        frames: Most frames predicted per sequence; None: all there are.
+        geodesic_frames: Frames per rollout at which geodesic distortion is sampled, evenly spaced.
+        max_sequences: Evaluate this many only, evenly spread over the list.
+        baselines: Also roll out the baselines.
+        device: "cpu", "cuda"; None: a GPU where there is one.
+        threads: CPU threads of torch; None leaves torch's own choice.
+        picture: Draw the error over time (needs matplotlib: extra `train`).
+        table: Make one of the paper's tables or figures, or `long`, rollouts of 1,000 frames.
+        tables: Options of the tables.
+    """
+
+    data: Path | None = None
+    out: Path | None = None
+    network: str = "default"
+    split: str = "test"
+    frames: int | None = None
+    geodesic_frames: int = 5
+    max_sequences: int | None = None
+    baselines: bool = True
+    device: str | None = None
+    threads: int | None = None
+    picture: bool = True
+    table: TableName | None = None
+    tables: tyro.conf.OmitArgPrefixes[TableOptions] = field(default_factory=TableOptions)
+
+
+def evaluate(config: EvaluateConfig) -> dict[str, Any]:
+    """Evaluates a network, or makes a table.
+
+    Returns:
+        `settings`, `network` (file, config, notes), `sequences` (per sequence and start: figures of each method),
+        `mean` (start -> method -> figures), `skipped` (name -> reason), `skipped_count`, `frames_predicted`,
+        `seconds_per_frame`; for tables what `tables.make_table` returns.
+
+    Raises:
+        OptionMissing: No data or no out folder.
+        NoTestData: Nothing to evaluate.
+        CheckpointError: No such network.
+        MissingExtra: A picture is wanted and matplotlib is missing.
+    """
+    if config.threads:
+        import torch
+
+        torch.set_num_threads(config.threads)
+    if config.picture:
+        _pyplot()
+    if config.table is not None:
+        from warpgarment.training.tables import make_table
+
+        return make_table(config)
+    for name in ("data", "out"):
+        if getattr(config, name) is None:
+            raise OptionMissing(f"an evaluation needs --{name} FOLDER")
+    path = checkpoint.find(config.network, device=config.device)
+    simulator = Simulator(checkpoint.load(path), config.device)
+    skipped: dict[str, str] = {}
+    folders = evenly(folders_of(Path(config.data), config.split, skipped), config.max_sequences)
+    found = measure(
+        simulator,
+        folders,
+        frames=config.frames,
+        geodesic_frames=config.geodesic_frames,
+        baselines=config.baselines,
+    )
+    skipped |= found.skipped
+    if not found.rows:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        raise NoTestData(f"{config.data}: no {config.split} sequence to evaluate ({reasons or 'none found'})")
+    settings = {k: v for k, v in vars(config).items() if k not in ("table", "tables")}
+    result = {
+        "settings": {k: v.name if isinstance(v, Path) else v for k, v in settings.items()},  # results travel
+        "network": _describe(path, simulator),
+        "frames_predicted": found.frames,
+        "seconds_per_frame": found.seconds / max(found.frames, 1),
+        "mean": means(found.rows),
+        "sequences": found.rows,
+        "skipped": skipped,
+        "skipped_count": len(skipped),
+    }
+    write(Path(config.out), result, found.curves, picture=config.picture)
+    return result
+
+
+def write(out: Path, result: dict[str, Any], curves: dict[tuple[str, str], list[np.ndarray]], *, picture: bool) -> None:
+    """Writes the result files, each under another name first."""
+    out.mkdir(parents=True, exist_ok=True)
+    _replace(out / "evaluation.json", lambda path: path.write_text(json.dumps(plain(result), indent=1), "utf-8"))
+    _replace(out / "evaluation.md", lambda path: path.write_text(table(result), "utf-8"))
+    if picture:
+        _replace(out / "error_over_time.png", lambda path: draw(path, curves))
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result as Markdown: means first, then every sequence."""
+    lines = [
+        "# Evaluation",
+        "",
+        f"Network `{result['network']['file']}`, data `{result['settings']['data']}`: "
+        f"{result['frames_predicted']:,} predicted frames, {1000 * result['seconds_per_frame']:.0f} ms each.",
+        "",
+        "Warm: from ten recorded frames; cold: from the first alone. Only predicted frames count. Chamfer and "
+        "geodesic distortion at sampled frames; deepest: of all sequences.",
+        "",
+    ]
+    headings = [heading for heading, _ in FIGURES.values()]
+    lines += _row(["start", "method", *headings, "failed"]), _row(["---"] * (len(headings) + 3))
+    for start, methods in result["mean"].items():
+        lines += [_row([start, method, *cells(f), str(f["failed"])]) for method, f in methods.items()]
+    lines += ["", _row(["sequence", "start", "frames", "method", *headings]), _row(["---"] * (len(headings) + 4))]
+    for row in result["sequences"]:
+        for method in METHODS:
+            if method in row:
+                lines.append(_row([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])]))
+    lines += ["", *skipped_lines(result["skipped"])]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def draw(path: Path, curves: dict[tuple[str, str], list[np.ndarray]]) -> None:
+    """Error over time: mean over the sequences that last so long, one curve per method, one panel per start."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), sharey=True, constrained_layout=True)
+    for axis, start in zip(axes, STARTS, strict=True):
+        for method in METHODS:
+            found = curves.get((method, start), [])
+            if not found:
+                continue
+            padded = np.full((len(found), max(map(len, found))), np.nan)
+            for i, curve in enumerate(found):
+                padded[i, : len(curve)] = curve
+            counted = np.maximum(np.isfinite(padded).sum(axis=0), 1)
+            mean = np.where(np.isfinite(padded).any(axis=0), np.nansum(padded, axis=0) / counted, np.nan)
+            axis.plot(np.arange(1, len(mean) + 1), mean, label=f"{method} ({len(found)})")
+        axis.set(title=f"{start} start", xlabel="predicted frame")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("mean vertex error [cm]")
+    axes[0].set_ylim(bottom=0)
+    axes[0].legend(frameon=False)
+    figure.savefig(path, dpi=150, format="png")
+    pyplot.close(figure)
+
+
+def _describe(path: Path, simulator: Simulator) -> dict[str, Any]:
+    _, notes = checkpoint.read_metadata(path)
+    return {"file": path.name, "config": vars(simulator.network.config), "notes": notes}
+
+
+def _row(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _replace(path: Path, make: Callable[[Path], Any]) -> None:
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        make(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _pyplot():
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise MissingExtra("train", "The picture of an evaluation (switched off by picture=False)") from error
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot

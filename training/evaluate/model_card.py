@@ -1,0 +1,246 @@
+"""A page about a trained network, with its failures as pictures, chosen by a rule that the page prints.
+
+    python -m warpgarment.training.evaluate.model_card --data sequences --network out/run/best.safetensors \\
+        --evaluation out/evaluation/evaluation.json --out out/card
+
+Writes `card.md` and `card/*.png`: what the network is, the data, the training and its curves (from the run's
+`log.jsonl`), the figures of an evaluation by start, method and category, and rollouts beside the teacher's, chosen by
+`RULE`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgarment.io.atomic import atomic_file, atomic_folder
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.sim.simulator import Simulator
+from warpgarment.training.data.card import Facts
+from warpgarment.training.data.sequence import Sequence as SequenceOnDisk
+from warpgarment.training.rollouts import predict
+
+from .model_card_page import page, ratio
+from .model_card_pictures import curves, rollout_sheet
+
+RULE = (
+    "Sequences are ordered by the ratio of the network's mean vertex error to that of the garment skinned to its "
+    "nearest body faces, both from a cold start; a rollout that failed comes last, and equal ratios go by name. Shown "
+    "are the first, the median (of an even number the better one) and the last two, each at the frames of largest "
+    "error that are at least half a second apart; the network above, the teacher below."
+)
+APART = 0.5  # seconds between the frames that are drawn
+AGREE = 0.05  # a rollout made again is expected to have the error it had before, up to this share
+
+
+class CardError(ValueError):
+    """The page cannot be written from these files; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class ModelCardConfig:
+    """Settings of a page.
+
+    Attributes:
+        data: Folder of the sequences that were evaluated.
+        network: Checkpoint file or folder, or the name of a network that ships.
+        evaluation: `evaluation.json` of this network, with baselines.
+        out: Folder for `card.md` and `card/`.
+        log: `log.jsonl` of the training; by default the one beside the checkpoint, if there is one.
+        moments: Frames drawn per sequence.
+        device: Of the rollouts, "cpu" or "cuda"; None: a GPU where there is one.
+        size: Width and height of each picture in pixels.
+    """
+
+    data: Path
+    network: str
+    evaluation: Path
+    out: Path
+    log: Path | None = None
+    moments: int = 4
+    device: str | None = None
+    size: tuple[int, int] = (210, 290)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sequence that is drawn.
+
+    Attributes:
+        role: "best", "median", "second worst", "worst", or several of them where there are few sequences.
+        row: Its row of the evaluation, from a cold start.
+        ratio: Of the network's error to the skinned garment's; infinite where the network's rollout failed.
+    """
+
+    role: str
+    row: Mapping[str, Any]
+    ratio: float
+
+    @property
+    def file(self) -> str:
+        """Name of its picture."""
+        return self.role.split(",")[0].replace(" ", "_") + ".png"
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A case as it was rolled out again: frames of the sequence that are drawn, and errors [cm] of all predicted ones.
+
+    `errors[k]` belongs to frame k + 1, since frame 0 is given; NaN from where a rollout failed.
+    """
+
+    case: Case
+    moments: list[int]
+    errors: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """Mean over the predicted frames [cm]; NaN for a rollout that failed."""
+        return float(self.errors.mean())
+
+    @property
+    def differs(self) -> bool:
+        """Whether this is not the rollout that was evaluated."""
+        before = self.case.row["network"].get("mean_vertex_error_cm")
+        before = math.nan if before is None else before
+        return not (math.isnan(self.error) and math.isnan(before)) and not abs(self.error - before) <= AGREE * before
+
+
+def write_card(config: ModelCardConfig) -> Path:
+    """Writes the page.
+
+    Returns:
+        `card.md`.
+
+    Raises:
+        CardError: The evaluation is damaged, of another network, without baselines, or of other sequences.
+        CheckpointError: No such network.
+        MissingExtra: Pictures need `pip install "warpgarment[view]"`.
+    """
+    path = checkpoint.find(config.network, device=config.device)
+    network = checkpoint.load(path)
+    _, notes = checkpoint.read_metadata(path)
+    evaluation = read_evaluation(config.evaluation, vars(network.config), notes)
+    log = config.log or (path if path.is_dir() else path.parent) / "log.jsonl"
+    if config.log is not None and not log.is_file():
+        raise CardError(f"{log}: no such file; leave log away for a page without curves")
+    lines = read_log(log) if log.is_file() else []
+    cases = chosen(evaluation["sequences"])
+    facts = Facts.of(config.data)
+    simulator = Simulator(network, config.device)
+    drawn = []
+    with atomic_folder(Path(config.out) / "card", "*.png") as folder:
+        pictured = curves(folder / "training.png", lines)
+        for case in cases:
+            drawn.append(_draw(folder / case.file, case, config, simulator))
+        text = page(path.name, network, notes, evaluation, facts, drawn, lines if pictured else [], RULE)
+    with atomic_file(Path(config.out) / "card.md") as temporary:
+        temporary.write_text(text, "utf-8")
+    return Path(config.out) / "card.md"
+
+
+def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, Any]) -> dict[str, Any]:
+    """The result of `evaluate`, if it is of the network with this config and these notes.
+
+    Raises:
+        CardError: It is not, or damaged.
+    """
+    try:
+        result = json.loads(Path(path).read_text("utf-8"))
+        about, mean = result["network"], result["mean"]
+        rows = [row for row in result["sequences"] if row["start"] == "cold" and row["network"] is not None]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CardError(f"{path}: no result of an evaluation ({type(error).__name__}: {error})") from error
+    # A setting that came later has its default in what was written before
+    settings = {f.name: f.default for f in dataclasses.fields(NetworkConfig)} | dict(about.get("config") or {})
+    if settings != dict(config) or about.get("notes") != dict(notes):
+        raise CardError(
+            f"{path}: is of another network ({about.get('file')}; its settings or notes differ). Evaluate this one."
+        )
+    if not rows or not all("skinned" in row for row in rows) or "cold" not in mean:
+        raise CardError(f"{path}: has no cold starts with the skinned baseline. Evaluate again, with baselines.")
+    return result
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """Lines of a training's log, by step; of those that a resumed run wrote again, the later. A torn line is left
+    out."""
+    found: dict[tuple[int, bool], dict[str, Any]] = {}
+    for line in path.read_text("utf-8").splitlines():
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(entry, dict) and isinstance(entry.get("step"), int):
+            for kind in ("loss", "rollout_error_cm"):
+                if kind in entry:
+                    found[entry["step"], kind == "loss"] = entry
+    return [found[key] for key in sorted(found)]
+
+
+def chosen(rows: Sequence[Mapping[str, Any]]) -> list[Case]:
+    """The best, the median, the second worst and the worst of the cold starts, by `RULE`.
+
+    Args:
+        rows: Of an evaluation.
+
+    Returns:
+        Best first, each sequence once; one that has several roles bears them all.
+    """
+    order = sorted((row for row in rows if row["start"] == "cold"), key=lambda row: (ratio(row), row["sequence"]))
+    last = len(order) - 1
+    roles: dict[int, list[str]] = {}
+    for role, place in {"best": 0, "median": last // 2, "second worst": max(last - 1, 0), "worst": last}.items():
+        roles.setdefault(place, []).append(role)
+    return [Case(", ".join(roles[place]), order[place], ratio(order[place])) for place in sorted(roles)]
+
+
+def largest(errors: np.ndarray, count: int, apart: int) -> list[int]:
+    """Where errors are largest: at most `count` places, each at least `apart` from the others; NaN does not count.
+
+    Returns:
+        Indices, ascending.
+    """
+    left = np.where(np.isfinite(errors), errors, -np.inf)
+    places: list[int] = []
+    while len(places) < count and np.isfinite(left).any():
+        place = int(left.argmax())
+        places.append(place)
+        left[max(place - apart + 1, 0) : place + apart] = -np.inf
+    return sorted(places)
+
+
+def _draw(path: Path, case: Case, config: ModelCardConfig, simulator: Simulator) -> Drawn:
+    """Rolls a sequence out again, as it was evaluated, and draws it."""
+    folder = Path(config.data) / str(case.row["sequence"])
+    if not folder.is_dir():
+        raise CardError(
+            f"{config.data}: has no sequence {folder.name}, which was evaluated. Name the data of that time."
+        )
+    sequence = SequenceOnDisk.load(folder)
+    steps = int(case.row["frames"])
+    if len(sequence) < steps + 1:
+        raise CardError(
+            f"{folder}: has {len(sequence)} frames, {steps + 1} were evaluated. Name the data of that time."
+        )
+    truth = np.array(sequence.vertices[: steps + 1], np.float32)
+    moved = np.concatenate([truth[:1], predict(simulator, sequence, 0, steps, cold=True)])
+    errors = 100.0 * np.linalg.norm(moved[1:].astype(np.float64) - truth[1:], axis=-1).mean(axis=1)
+    moments = [place + 1 for place in largest(errors, config.moments, max(round(APART * sequence.fps), 1))] or [0]
+    drawn = Drawn(case, moments, errors)
+    rollout_sheet(path, sequence, moved, truth, drawn, size=config.size)
+    return drawn
+
+
+if __name__ == "__main__":
+    import tyro
+
+    print(write_card(tyro.cli(ModelCardConfig, description="Writes a page about a trained network.")))

@@ -1,0 +1,121 @@
+"""The gate every simulated sequence passes: penetration, stretch, speed, layers, and the frame that failed first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warpgarment.objects.garment import Garment
+from warpgarment.training.garments.layers import LayerFigures
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a good frame may not exceed.
+
+    Attributes:
+        penetration: Deepest vertex inside the collider [m].
+        stretch: 99th percentile of the relative change of edge lengths.
+        largest_stretch: Largest relative change of an edge's length.
+        slip: Largest distance a vertex moves in a frame beyond three times the fastest body vertex [m]; wind may add
+            what it blows in a frame.
+        layer_inside: Largest share of an outer garment's vertices inside an inner one.
+    """
+
+    penetration: float = 0.010
+    stretch: float = 0.30
+    largest_stretch: float = 1.0
+    slip: float = 0.15
+    layer_inside: float = 0.01
+
+
+@dataclass
+class QualityGate:
+    """Measures frames as they come and says why one is not good.
+
+    Args:
+        garments: Rest meshes, innermost first; frames hold their vertices end to end.
+        collider_faces: Faces of the body that cloth collides with, shape [G, 3].
+        limits: What is allowed.
+        every: Penetration and layers are measured in every n-th frame.
+        air: What the air moves in a frame at most [m], allowed on top of `slip`.
+    """
+
+    garments: Sequence[Garment]
+    collider_faces: np.ndarray
+    limits: Limits = field(default_factory=Limits)
+    every: int = 3
+    air: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._starts = np.cumsum([0, *(len(g.vertices) for g in self.garments)])
+        self._edges = np.concatenate([g.edges + s for g, s in zip(self.garments, self._starts, strict=False)])
+        self._rest_length = self._lengths(np.concatenate([g.vertices for g in self.garments]).astype(np.float64))
+        self._layers = LayerFigures(self.garments) if len(self.garments) > 1 else None
+        self._previous: tuple[np.ndarray, np.ndarray] | None = None
+        self._frames: list[dict[str, float]] = []
+
+    def check(self, frame: int, vertices: np.ndarray, body_vertices: np.ndarray) -> str | None:
+        """Records a frame; returns why it is not good, or None.
+
+        Args:
+            frame: Its number.
+            vertices: Garments [m], shape [V, 3].
+            body_vertices: Body [m], shape [U, 3].
+        """
+        if not np.isfinite(vertices).all():
+            return f"frame {frame}: {int((~np.isfinite(vertices)).any(1).sum()):,} vertices are not finite"
+        points = vertices.astype(np.float64)
+        stretch = np.abs(self._lengths(points) / self._rest_length - 1)
+        figures = {"stretch_mean": stretch.mean(), "stretch_max": stretch.max()}
+        figures["stretch_p99"] = np.quantile(stretch, 0.99)
+        if self._previous is not None:
+            moved = np.linalg.norm(points - self._previous[0], axis=1).max()
+            body_moved = np.linalg.norm(body_vertices - self._previous[1], axis=1).max()
+            figures |= {"step_max": moved, "slip": moved - 3 * body_moved - self.air}
+        self._previous = (points, body_vertices)
+        if frame % self.every == 0:
+            distance = self._signed_distance(points, body_vertices)
+            figures |= {"penetration": max(0.0, -float(distance.min())), "inside": float((distance < 0).mean())}
+            if self._layers:
+                figures |= self._layers.measure(np.split(points, self._starts[1:-1]))
+        self._frames.append({k: float(v) for k, v in figures.items()})
+        limits = self.limits
+        for name, limit, unit in (
+            ("penetration", limits.penetration, 1e3),
+            ("stretch_p99", limits.stretch, 1e2),
+            ("stretch_max", limits.largest_stretch, 1e2),
+            ("slip", limits.slip, 1e3),
+            ("layer_inside", limits.layer_inside, 1e2),
+        ):
+            value = figures.get(name, 0.0)
+            if value > limit:
+                suffix = "%" if name.startswith(("stretch", "layer")) else " mm"
+                return f"frame {frame}: {name} {value * unit:.1f}{suffix} is over {limit * unit:.0f}{suffix}"
+        return None
+
+    def _lengths(self, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points[self._edges[:, 0]] - points[self._edges[:, 1]], axis=1)
+
+    def _signed_distance(self, points: np.ndarray, body_vertices: np.ndarray) -> np.ndarray:
+        import igl
+
+        return igl.signed_distance(
+            points,
+            body_vertices.astype(np.float64),
+            self.collider_faces.astype(np.int64),
+            sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
+        )[0]
+
+    def figures(self, frames: int) -> dict[str, float]:
+        """Figures over the first `frames` frames: means of means, maxima of maxima."""
+        kept = self._frames[:frames]
+        names = sorted({name for f in kept for name in f})
+        summary = {}
+        for name in names:
+            values = [f[name] for f in kept if name in f]
+            combine = np.mean if name in ("stretch_mean", "inside") else np.max
+            summary[name] = float(combine(values))
+        return summary

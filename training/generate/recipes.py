@@ -1,0 +1,278 @@
+"""What a data set consists of: recipes, splits, and the plan of every sequence.
+
+A plan holds all parameters of one sequence and is a pure function of the set's configuration, the sequence's number and
+the attempt, so any sequence can be made again, on any machine, in any order. Three recipes:
+
+- `cloth3d`: single garments in the manner of CLOTH3D: seven categories, cut and resized, one material. As in
+  *Neural Garment Dynamics via Manifold-Aware Transformers* (section 4), skirts are only ever tested on.
+- `layers`: outfits of two and three garments in the manner of D-LAYERS, each with a material of its own, in the wind.
+- `seams`: one dress with random slits and open seams, ten cuts to train on and two to test (figure 9 there).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from warpgarment.training.garments.make import CATEGORIES, sampled_pattern
+from warpgarment.training.garments.outfits import OutfitPattern, sampled_outfit
+from warpgarment.training.garments.seams import Seams, sampled_seams
+from warpgarment.training.materials import Material, sampled_material
+from warpgarment.training.motions.clips import clip_frames, list_clips
+from warpgarment.training.motions.procedural import KINDS
+
+from .wind import Wind, sampled_wind
+
+FPS = 30.0
+BLEND = 30
+SPLITS = ("train", "validation", "test")
+TRAINING_CUTS, TEST_CUTS = 10, 2
+GAP = 0.011  # least distance of a single garment from the body at the start [m]
+
+Recipe = Literal["cloth3d", "layers", "seams"]
+
+
+@dataclass(frozen=True)
+class GenerateConfig:
+    """Options of `warpgarment generate`. The first group determines the sequences; the second only how they are made.
+
+    Attributes:
+        out: Folder of the data set.
+        recipe: What it consists of.
+        sequences: How many to make; 240 of `cloth3d` is the standard set.
+        frames: Frames of motion per sequence, after 30 that blend in from the rest pose.
+        faces: Faces of a T-shirt; other categories scale with their area.
+        categories: Garments of `cloth3d`, in turn.
+        held_out: Categories that are only tested on.
+        motions: Folder of BVH and AMASS clips; without one, motions are procedural.
+        procedural_share: Share of procedural motions among the training sequences where there are clips.
+        bodies: "anny" samples Anny's shapes (extra `bodies`); "bundled" uses the one body that ships.
+        teacher: What simulates.
+        materials: "fixed" gives every garment the same cloth, "sampled" its own; None: as the recipe has it.
+        wind: Whether the air moves; None: as the recipe has it.
+        seed: Of the whole set.
+        attempts: How often a sequence that the gate rejects is drawn anew.
+        least_frames: A sequence that fails later than this is kept up to the failure.
+        first: Number of the first sequence to make.
+        shard: "i/n": make only the sequences whose number is i modulo n, for n machines.
+        workers: Processes.
+        worlds: Sequences simulated at once by each process, on a GPU.
+        device: Warp device of the teacher.
+        ray: Run on a Ray cluster: its address, or "local" for one on this machine (extra `cluster`).
+        attempt: Make this attempt only, to reproduce a rejection.
+        keep_rejected: Write the frames of rejected sequences too.
+        make_blender: First make the virtual environment that the Blender teacher needs.
+    """
+
+    out: Path
+    recipe: Recipe = "cloth3d"
+    sequences: int = 240
+    frames: int = 270
+    faces: int = 1200
+    categories: tuple[str, ...] = CATEGORIES
+    held_out: tuple[str, ...] = ("skirt",)
+    motions: Path | None = None
+    procedural_share: float = 0.25
+    bodies: Literal["anny", "bundled"] = "anny"
+    teacher: Literal["newton", "blender"] = "newton"
+    materials: Literal["fixed", "sampled"] | None = None
+    wind: bool | None = None
+    seed: int = 0
+    attempts: int = 4
+    least_frames: int = 150
+
+    first: int = 0
+    shard: str = "0/1"
+    workers: int = 1
+    worlds: int = 1
+    device: str = "cpu"
+    ray: str | None = None
+    attempt: int | None = None
+    keep_rejected: bool = False
+    make_blender: bool = False
+
+    def __post_init__(self) -> None:
+        unknown = sorted({*self.categories, *self.held_out} - set(CATEGORIES))
+        if unknown:
+            raise ConfigurationError(f"unknown garment categories {unknown}; there are {', '.join(CATEGORIES)}.")
+        if not set(self.categories) - set(self.held_out):
+            raise ConfigurationError("every category is held out; none is left to train on.")
+        match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
+        if not match or int(match[1]) >= int(match[2]):
+            raise ConfigurationError(f"shard must be i/n with i below n, such as 0/2, got {self.shard!r}.")
+        for name in ("sequences", "frames", "faces", "attempts", "workers", "worlds"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.motions is not None and not list_clips(Path(self.motions)):
+            raise FileNotFoundError(f"no .bvh or .npz clips in {self.motions}")
+
+    @property
+    def with_materials(self) -> bool:
+        """Whether every garment has a material of its own."""
+        return self.recipe == "layers" if self.materials is None else self.materials == "sampled"
+
+    @property
+    def with_wind(self) -> bool:
+        """Whether the air moves in some sequences."""
+        return self.recipe == "layers" if self.wind is None else self.wind
+
+    def determining(self) -> dict[str, Any]:
+        """The options that the sequences depend on, as plain values; clips by name and size, not by folder."""
+        values = {k: v for k, v in asdict(self).items() if k in _DETERMINING}
+        clips = list_clips(Path(self.motions)) if self.motions else []
+        values["clips"] = {p.name: p.stat().st_size for p in clips}
+        single = self.recipe == "cloth3d"
+        chosen = {"categories": list(self.categories), "held_out": list(self.held_out)}
+        return values | (chosen if single else {"categories": [], "held_out": []})
+
+    def command(self) -> str:
+        """What makes the set again; the folder of clips is the user's own."""
+        words = ["warpgarment generate --out DIR"] + (["--motions CLIPS"] if self.motions else [])
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if option.name not in (*_DETERMINING, "sequences", "categories", "held_out") or value == option.default:
+                continue
+            shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+            words.append(f"--{option.name.replace('_', '-')} {shown}")
+        return " ".join(words)
+
+
+_DETERMINING = (
+    "recipe", "frames", "faces", "procedural_share", "bodies", "teacher", "materials", "wind", "seed", "attempts",
+    "least_frames",
+)  # fmt: skip
+
+
+class ConfigurationError(ValueError):
+    """Options that do not fit together."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that determines a sequence.
+
+    Attributes:
+        number: Of the sequence.
+        attempt: Counts up when the gate has rejected the one before.
+        recipe: Of the set.
+        split: "train", "validation" or "test".
+        motion: Name of a clip, or "procedural:kind".
+        start: Where in the clip the window starts, as a share of what is possible.
+        mirror: Whether left and right are exchanged.
+        body: "anny", "bundled", "mannequin" or "creature".
+        phenotype: Anny's shape parameters.
+        outfit: Measures of the garments, innermost first.
+        materials: One a garment.
+        wind: None: still air.
+        seams: Cuts of the (only) garment; None: none.
+        cut: Number of these cuts; None: none.
+        frames: Frames of motion.
+    """
+
+    number: int
+    attempt: int
+    recipe: str
+    split: str
+    motion: str
+    start: float
+    mirror: bool
+    body: str
+    phenotype: dict[str, float]
+    outfit: OutfitPattern
+    materials: tuple[Material, ...]
+    wind: Wind | None
+    seams: Seams | None
+    cut: int | None
+    frames: int
+
+    @property
+    def category(self) -> str:
+        """The category, or those of an outfit joined by "+"."""
+        return "+".join(pattern.category for pattern in self.outfit.layers)
+
+    @property
+    def name(self) -> str:
+        """The sequence's folder."""
+        return f"{self.number:05d}_{self.category}"
+
+
+def split_of_number(number: int) -> str:
+    """Which split a sequence belongs to: of 24, three are for testing and one for validation (200 : 10 : 30 of 240)."""
+    return "test" if number % 8 == 3 else "validation" if number % 24 == 5 else "train"
+
+
+def clip_group(name: str) -> str:
+    """Clips of the same performance share a group: the two partners of a salsa are numbered 01-15 and 16-30."""
+    salsa = re.search(r"salsa_(\d+)", name)
+    return f"salsa_{(int(salsa.group(1)) - 1) % 15 + 1:02d}" if salsa else name
+
+
+def split_of_clips(names: list[str]) -> dict[str, str]:
+    """Splits clips by performance: every sixth group is for testing, every twelfth for validation."""
+    groups = sorted({clip_group(n) for n in names})
+    held = {g: "test" if i % 6 == 2 else "validation" if i % 12 == 5 else "train" for i, g in enumerate(groups)}
+    return {n: held[clip_group(n)] for n in names}
+
+
+def plan_sequence(config: GenerateConfig, number: int, attempt: int = 0) -> Plan:
+    """The parameters of a sequence: a pure function of the configuration, its number and the attempt."""
+    rng = np.random.default_rng([config.seed, number, attempt])
+    split = split_of_number(number)
+    order = sum(split_of_number(n) == split for n in range(number))
+    motion = _motion(config, split, rng)
+    start, mirror = float(rng.random()), bool(rng.random() < 0.5)
+    body, phenotype = _body(config, split, order, rng)
+    outfit, cut = _outfit(config, split, order, rng)
+    seams = None
+    if cut is not None:
+        seams = sampled_seams(np.random.default_rng([config.seed, 2, cut]), "dress")
+    count = len(outfit.layers)
+    materials = tuple(sampled_material(rng) if config.with_materials else Material() for _ in range(count))
+    wind = sampled_wind(rng) if config.with_wind and rng.random() < 0.5 else None
+    return Plan(
+        number, attempt, config.recipe, split, motion, start, mirror, body, phenotype, outfit, materials, wind, seams,
+        cut, config.frames,
+    )  # fmt: skip
+
+
+def _motion(config: GenerateConfig, split: str, rng: np.random.Generator) -> str:
+    clips = list_clips(Path(config.motions)) if config.motions else []
+    splits = split_of_clips([p.stem for p in clips])
+    candidates = [p for p in clips if splits[p.stem] == split]
+    if split != "train":  # held-out rollouts should run for the whole length
+        candidates = [p for p in candidates if clip_frames(p) >= config.frames + 8] or candidates
+    if candidates and not (split == "train" and rng.random() < config.procedural_share):
+        return candidates[int(rng.integers(len(candidates)))].stem
+    return f"procedural:{KINDS[int(rng.integers(len(KINDS)))]}"
+
+
+def _body(config: GenerateConfig, split: str, order: int, rng: np.random.Generator) -> tuple[str, dict[str, float]]:
+    """Every tenth test sequence is on the mannequin, another on the creature."""
+    from warpgarment.training.bodies.anny import sampled_phenotype
+
+    if config.recipe == "seams":  # one body throughout
+        rng = np.random.default_rng([config.seed, 3])
+    phenotype = sampled_phenotype(rng)
+    if config.recipe == "cloth3d" and split == "test" and order % 10 in (4, 9):
+        other = "mannequin" if order % 10 == 4 else "creature"
+        if config.bodies == "anny" or other == "creature":
+            return other, {}
+    return config.bodies, phenotype if config.bodies == "anny" else {}
+
+
+def _outfit(
+    config: GenerateConfig, split: str, order: int, rng: np.random.Generator
+) -> tuple[OutfitPattern, int | None]:
+    """Measures of the garments, and the number of the cuts where the recipe has cuts."""
+    if config.recipe == "layers":
+        return sampled_outfit(rng, config.faces), None
+    if config.recipe == "seams":
+        cut = TRAINING_CUTS + order % TEST_CUTS if split == "test" else order % TRAINING_CUTS
+        dress = sampled_pattern("dress", np.random.default_rng([config.seed, 1]), config.faces)
+        return OutfitPattern((dress,), (GAP,)), cut
+    kept = [c for c in config.categories if split == "test" or c not in config.held_out]
+    return OutfitPattern((sampled_pattern(kept[order % len(kept)], rng, config.faces),), (GAP,)), None

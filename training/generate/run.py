@@ -1,0 +1,246 @@
+"""`warpgarment generate`: simulated sequences, each a pure function of the set's options and its number.
+
+    warpgarment generate --out DATA --motions CLIPS --workers 2               # the standard set
+    warpgarment generate --out DATA --recipe layers --sequences 50            # outfits, materials, wind
+    warpgarment generate --out DATA --first 17 --sequences 1 --attempt 0 --keep-rejected    # one attempt again
+
+Sequences that exist are skipped, so an interrupted run continues where it stopped, and a worker that is killed loses
+what it was on. A sequence that the quality gate rejects is drawn anew, up to `attempts` times; the manifest keeps the
+parameters and the reason of every attempt.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgarment.objects.garment import Garment
+from warpgarment.training.data.sequence import MANIFEST, write_sequence
+from warpgarment.training.data.set_manifest import package_versions, write_set_manifest
+from warpgarment.training.teachers import ClothScene, Teacher, TeacherError, make_teacher
+
+from .placement import body_motion, clothed
+from .quality import Limits, QualityGate
+from .recipes import BLEND, FPS, GenerateConfig, Plan, plan_sequence
+
+
+@dataclass
+class Attempt:
+    """One attempt at a sequence: what it is made from, what came out.
+
+    Attributes:
+        plan: Its parameters.
+        scene: What the teacher simulates; None where the plan could not be carried out.
+        reason: Why it is rejected; None: good so far.
+        arrays: What is stored besides the garments' frames.
+        gate: Measures the frames.
+        frames: Garment vertices of the good frames, float32 [V, 3] each.
+        garments: Rest meshes.
+        began: When work on it started [s].
+    """
+
+    plan: Plan
+    scene: ClothScene | None = None
+    reason: str | None = None
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    gate: QualityGate | None = None
+    frames: list[np.ndarray] = field(default_factory=list)
+    garments: tuple[Garment, ...] = ()
+    body_frames: np.ndarray | None = None
+    began: float = field(default_factory=time.perf_counter)
+
+
+def prepare(plan: Plan, config: GenerateConfig) -> Attempt:
+    """Body, motion, garments, scene and gate of a plan; what cannot be made leaves its reason."""
+    attempt = Attempt(plan)
+    try:
+        body, transforms, frames = body_motion(plan, config)
+        garments, cloths = clothed(plan, body, transforms)
+    except ValueError as error:  # a motion that cannot be cleared, a garment that cannot be cut for this body
+        attempt.reason = str(error)
+        return attempt
+    collider = body.collider_faces()
+    faces = body.faces[collider]
+    wind = plan.wind.velocities(len(frames), FPS) if plan.wind else None
+    starts = np.cumsum([0, *(len(g.vertices) for g in garments)])
+    attempt.scene = ClothScene(cloths, frames, faces, fps=FPS, wind=wind)
+    attempt.garments, attempt.body_frames = garments, frames
+    blown = float(np.linalg.norm(wind, axis=1).max()) / FPS if wind is not None else 0.0
+    attempt.gate = QualityGate(garments, faces, air=blown)
+    attempt.arrays = {
+        "garment_rest_vertices": np.concatenate([g.vertices for g in garments]),
+        "garment_faces": np.concatenate([g.faces + s for g, s in zip(garments, starts, strict=False)]),
+        "pins": np.concatenate([g.pins + s for g, s in zip(garments, starts, strict=False)]),
+        "garment_starts": starts,
+        "body_rest_vertices": body.vertices,
+        "body_faces": body.faces,
+        "collider_faces": collider,
+        "bone_indices": body.bone_indices,
+        "bone_weights": body.bone_weights,
+        "bone_transforms": transforms,
+    }
+    if wind is not None:
+        attempt.arrays["wind"] = wind
+    return attempt
+
+
+def simulate(attempts: list[Attempt], teacher: Teacher) -> None:
+    """Simulates attempts side by side until each is complete or rejected."""
+    live = [a for a in attempts if a.reason is None]
+    if not live:
+        return
+    if len(live) == 1:
+        stream = ([vertices] for vertices in teacher.simulate(live[0].scene))
+    else:
+        stream = teacher.simulate_many([a.scene for a in live])
+    for frame, worlds in enumerate(stream):
+        for attempt, vertices in zip(live, worlds, strict=True):
+            if vertices is None or attempt.reason:
+                continue
+            attempt.reason = attempt.gate.check(frame, vertices, attempt.body_frames[frame])
+            if not attempt.reason:
+                attempt.frames.append(vertices)
+        if all(a.reason for a in live):
+            break
+
+
+def manifest_of(attempt: Attempt, config: GenerateConfig, teacher: Teacher) -> dict[str, Any]:
+    """What is known about an attempt once it is simulated; a late failure cuts the sequence short before it."""
+    plan, reason, kept = attempt.plan, attempt.reason, len(attempt.frames)
+    cut_short = None
+    if reason and kept > config.least_frames:
+        cut_short, reason = reason, None
+        kept -= 5  # the frames before a failure are on their way to it
+    patterns = plan.outfit.layers
+    return {
+        "number": plan.number,
+        "attempt": plan.attempt,
+        "recipe": plan.recipe,
+        "seed": config.seed,
+        "split": plan.split,
+        "category": plan.category,
+        "garment": plan.name if plan.cut is None else f"{plan.category}_cut_{plan.cut:02d}",
+        "garments": [
+            {"name": f"{pattern.category}_{plan.number:05d}", "category": pattern.category, "material": m.as_dict()}
+            for pattern, m in zip(patterns, plan.materials, strict=True)
+        ],
+        "motion": plan.motion,
+        "body": {"kind": plan.body} | plan.phenotype,
+        "fps": FPS,
+        "blend": BLEND,
+        "parameters": asdict(plan) | {"teacher": teacher.settings(), "limits": asdict(Limits())},
+        "status": "rejected" if reason else "good",
+        "reason": reason,
+        "cut_short": cut_short,
+        "frames": kept,
+        "figures": attempt.gate.figures(kept) if attempt.gate else {},
+        "seconds": round(time.perf_counter() - attempt.began, 1),
+    }
+
+
+def make_sequences(config: GenerateConfig, numbers: list[int]) -> list[dict[str, Any]]:
+    """Makes sequences side by side and writes them; those rejected are drawn anew. Returns their manifests."""
+    teacher = make_teacher(config.teacher, config.device)
+    versions = package_versions()
+    first = config.attempt or 0
+    last = first if config.attempt is not None else config.attempts - 1
+    tries: dict[int, list[dict[str, Any]]] = {n: [] for n in numbers}
+    finished = []
+    pending = list(numbers)
+    for number in range(first, last + 1):
+        attempts = [prepare(plan_sequence(config, n, number), config) for n in pending]
+        simulate(attempts, teacher)
+        pending = []
+        for attempt in attempts:
+            manifest = manifest_of(attempt, config, teacher) | {"versions": versions}
+            plan = attempt.plan
+            if manifest["status"] == "rejected" and number < last:
+                tries[plan.number].append(manifest)
+                pending.append(plan.number)
+                continue
+            manifest["rejected_attempts"] = tries[plan.number]
+            write_sequence(config.out / plan.name, _arrays(attempt, manifest, config), manifest)
+            finished.append(manifest)
+        if not pending:
+            break
+    return finished
+
+
+def _arrays(attempt: Attempt, manifest: dict[str, Any], config: GenerateConfig) -> dict[str, np.ndarray]:
+    frames = manifest["frames"]
+    if not frames or (manifest["status"] == "rejected" and not config.keep_rejected):
+        return {}
+    cut = {k: attempt.arrays[k][:frames] for k in ("bone_transforms", "wind") if k in attempt.arrays}
+    return attempt.arrays | cut | {"garment_vertices": np.stack(attempt.frames[:frames])}
+
+
+def numbers_to_make(config: GenerateConfig) -> list[int]:
+    """Numbers of this shard that are not there yet, failed ones included."""
+    index, count = map(int, config.shard.split("/"))
+    done = {p.parent.name.split("_")[0] for p in config.out.glob(f"[0-9]*_*/{MANIFEST}")}
+    numbers = range(config.first, config.first + config.sequences)
+    return [n for n in numbers if n % count == index and f"{n:05d}" not in done]
+
+
+def generate(config: GenerateConfig) -> Path:
+    """Makes the sequences that are not there yet; returns the data set's folder.
+
+    Raises:
+        DatasetMismatch: The folder holds a set made with other options.
+        TeacherError: Sequences failed; the message says how many and why.
+    """
+    from tqdm import tqdm
+
+    from .cluster import on_cluster
+    from .workers import spread
+
+    config = replace(config, out=Path(config.out), motions=Path(config.motions) if config.motions else None)
+    if config.make_blender:
+        from warpgarment.training.teachers.blender.environment import make_environment
+
+        make_environment()
+    if config.bodies == "anny":
+        from warpgarment.training.bodies.anny import anny_bodies
+
+        anny_bodies()  # builds the cache once, not in every worker
+    teacher = make_teacher(config.teacher, config.device)  # says now what is missing
+    config.out.mkdir(parents=True, exist_ok=True)
+    numbers, planned = numbers_to_make(config), range(config.first, config.first + config.sequences)
+    write_set_manifest(config.out, config.determining(), teacher.settings(), numbers=planned, command=config.command())
+    batches = [numbers[i : i + config.worlds] for i in range(0, len(numbers), config.worlds)]
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers
+    make = partial(make_sequences, config)
+    gpus = float(config.device.startswith("cuda"))
+    stream = on_cluster(make, batches, config.ray, gpus=gpus) if config.ray else spread(make, batches, config.workers)
+    counts, frames, failures = {"good": 0, "rejected": 0, "failed": 0}, 0, []
+    with tqdm(total=len(numbers), unit="seq") as bar:
+        for done in stream:
+            if done.error:
+                counts["failed"] += len(done.item)
+                failures.append(done)
+                tqdm.write(f"{', '.join(map(str, done.item))}: failed: {done.error}")
+            for manifest in done.result or []:
+                counts[manifest["status"]] += 1
+                frames += manifest["frames"] if manifest["status"] == "good" else 0
+                tqdm.write(_line(manifest))
+            bar.set_postfix(counts | {"frames": frames})
+            bar.update(len(done.item))
+    if failures:
+        raise TeacherError(
+            f"{counts['failed']} of {len(numbers)} sequences failed (first: number {failures[0].item[0]}, "
+            f"{failures[0].error}). Run the same command again to make them."
+        )
+    return config.out
+
+
+def _line(manifest: dict[str, Any]) -> str:
+    text = f"{manifest['garment']} on {manifest['motion']}: {manifest['status']} {manifest['frames']} frames"
+    if manifest["attempt"]:
+        text += f", attempt {manifest['attempt'] + 1}"
+    return text + (f" ({manifest['reason']})" if manifest["reason"] else "")

@@ -1,0 +1,131 @@
+"""The reader of AMASS motions: SMPL joint angles in .npz files, Z up.
+
+No SMPL model is needed. Joint angles are taken from the T-pose, whose limb directions are those of any T-pose; the
+offsets below are rounded lengths of an average adult, used for directions and for the ratio of leg lengths only.
+Fingers and faces are left out; the 22 joints read are the first of SMPL, SMPL-H and SMPL-X alike.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+from tokenize import TokenError
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warpgarment.errors import MeshError
+
+from .clip import Clip, checked_finite, frame_rate
+
+# Our name, the parent's number and the offset from it [m] of SMPL's joints, in SMPL's order; Y up, facing +Z.
+_JOINTS = (
+    ("Hips", -1, (0.0, 0.0, 0.0)),
+    ("LeftUpLeg", 0, (0.06, -0.09, 0.0)),
+    ("RightUpLeg", 0, (-0.06, -0.09, 0.0)),
+    ("LowerBack", 0, (0.0, 0.12, -0.03)),
+    ("LeftLeg", 1, (0.04, -0.38, 0.0)),
+    ("RightLeg", 2, (-0.04, -0.38, 0.0)),
+    ("Spine", 3, (0.0, 0.14, 0.0)),
+    ("LeftFoot", 4, (-0.01, -0.40, -0.04)),
+    ("RightFoot", 5, (0.01, -0.40, -0.04)),
+    ("Spine1", 6, (0.0, 0.05, 0.03)),
+    ("LeftToeBase", 7, (0.04, -0.06, 0.12)),
+    ("RightToeBase", 8, (-0.04, -0.06, 0.12)),
+    ("Neck", 9, (0.0, 0.21, -0.04)),
+    ("LeftShoulder", 9, (0.08, 0.12, -0.02)),
+    ("RightShoulder", 9, (-0.08, 0.12, -0.02)),
+    ("Head", 12, (0.0, 0.09, 0.05)),
+    ("LeftArm", 13, (0.09, 0.03, -0.01)),
+    ("RightArm", 14, (-0.09, 0.03, -0.01)),
+    ("LeftForeArm", 16, (0.26, -0.01, -0.02)),
+    ("RightForeArm", 17, (-0.26, -0.01, -0.02)),
+    ("LeftHand", 18, (0.25, 0.01, 0.0)),
+    ("RightHand", 19, (-0.25, 0.01, 0.0)),
+)
+_WIDTHS = {66: "22 joints", 72: "SMPL", 156: "SMPL-H", 165: "SMPL-X"}
+_RATES = ("mocap_framerate", "mocap_frame_rate", "framerate")
+_UNREADABLE = (
+    OSError, ValueError, EOFError, AttributeError, TypeError, KeyError, RuntimeError, TokenError, zipfile.BadZipFile,
+    zlib.error,
+)  # fmt: skip
+_PELVIS = np.array([0.0, -0.22, 0.03])  # where the average body's root rests [m]; translations are relative to it
+_Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def read_amass(path: str | Path) -> Clip:
+    """Reads an AMASS-style .npz: `poses` [T, 66, 72, 156 or 165] axis-angles, `trans` [T, 3] [m], a frame rate.
+
+    Gender and shape do not matter and are not read; nothing in the file is unpickled.
+
+    Raises:
+        MeshError: The file is no .npz; keys are missing or have other shapes; NaN or infinity; an unknown frame rate.
+    """
+    path = Path(path)
+    arrays = _opened(path, ("poses", "trans"))
+    poses, trans = arrays["poses"], arrays["trans"]
+    _check_shape(path, poses.shape, poses.dtype)
+    if trans.shape != (len(poses), 3) or trans.dtype.kind not in "fiu":
+        raise MeshError(f"{path.name}: trans must be [T,3], T = {len(poses):,} as in poses, got {list(trans.shape)}.")
+    checked_finite(poses, path.name)
+    checked_finite(trans, path.name)
+    turns = Rotation.from_rotvec(poses[:, : 3 * len(_JOINTS)].reshape(-1, 3).astype(np.float64)).as_matrix()
+    rotations = turns.reshape(len(poses), len(_JOINTS), 3, 3)
+    rotations[:, 0] = _Z_UP_TO_Y_UP @ rotations[:, 0]  # which turns SMPL's own axes, Y up, to the file's, Z up
+    for joint, (_, parent, _) in enumerate(_JOINTS[1:], start=1):
+        rotations[:, joint] = rotations[:, parent] @ rotations[:, joint]
+    return Clip(
+        names=tuple(name for name, _, _ in _JOINTS),
+        offsets=np.array([offset for _, _, offset in _JOINTS]),
+        rotations=rotations,
+        root=(trans.astype(np.float64) + _PELVIS) @ _Z_UP_TO_Y_UP.T,
+        fps=arrays["rate"],
+    )
+
+
+def amass_length(path: str | Path) -> tuple[int, float]:
+    """Frames and frames per second of an AMASS file, from its headers.
+
+    Raises:
+        MeshError: As :func:`read_amass`, as far as headers tell.
+    """
+    path = Path(path)
+    rate = _opened(path, ())["rate"]
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("poses.npy") as member:
+            version = np.lib.format.read_magic(member)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(member)
+    except _UNREADABLE as error:
+        raise MeshError(f"{path.name} is not an .npz file of plain arrays ({error}).") from error
+    _check_shape(path, shape, dtype)
+    return shape[0], rate
+
+
+def _opened(path: Path, names: tuple[str, ...]) -> dict:
+    """The named arrays and `rate`, a number."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            rates = [name for name in _RATES if name in data.files]
+            missing = [name for name in ("poses", "trans") if name not in data.files]
+            if missing or not rates:
+                raise MeshError(
+                    f"{path.name} is no AMASS motion: it lacks {', '.join(missing) or 'mocap_framerate'}; "
+                    f"it holds {', '.join(data.files[:8]) or 'nothing'}."
+                )
+            rate = np.asarray(data[rates[0]])
+            arrays = {name: data[name] for name in names}
+    except (MeshError, FileNotFoundError):
+        raise
+    except _UNREADABLE as error:
+        raise MeshError(f"{path.name} is not an .npz file of plain arrays ({error}).") from error
+    if rate.size != 1 or rate.dtype.kind not in "fiu":
+        raise MeshError(f"{path.name}: {rates[0]} must be one number, got {rate.dtype} {list(rate.shape)}.")
+    return arrays | {"rate": frame_rate(float(rate.reshape(())), path.name)}
+
+
+def _check_shape(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    if len(shape) != 2 or shape[0] == 0 or shape[1] not in _WIDTHS or dtype.kind != "f":
+        known = ", ".join(f"{width} ({name})" for width, name in _WIDTHS.items())
+        raise MeshError(f"{path.name}: poses must be numbers [T,D] with D one of {known}, got {dtype} {list(shape)}.")

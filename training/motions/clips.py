@@ -1,0 +1,133 @@
+"""Motions from files: clips read by suffix, and put on a body by world-space rotations.
+
+Retargeting copies each source bone's rotation from its zero pose, in the world, after turning the zero pose of the
+limbs onto the target's rest pose. Root translation is scaled by the ratio of leg lengths, so file units do not matter.
+"""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warpgarment.errors import MeshError
+from warpgarment.training.bodies.anny import RestBody
+from warpgarment.training.bodies.skeleton import PoseSequence
+
+from .amass import amass_length, read_amass
+from .bvh import bvh_length, read_bvh
+from .clip import Clip, resampled, resampled_length
+
+__all__ = ["Clip", "clip_frames", "jumps", "list_clips", "read_amass", "read_bvh", "read_clip", "resampled", "retarget"]
+
+# What the DAZ-friendly CMU release calls the bones of the MotionBuilder-friendly one; None takes the parent's rotation.
+_DAZ = {
+    "Hips": "hip", "LowerBack": "hip", "Spine": "abdomen", "Spine1": "chest", "Neck": "neck", "Neck1": "neck",
+    "Head": "head",
+    "LeftUpLeg": "lThigh", "LeftLeg": "lShin", "LeftFoot": "lFoot",
+    "RightUpLeg": "rThigh", "RightLeg": "rShin", "RightFoot": "rFoot",
+    "LeftShoulder": "lCollar", "LeftArm": "lShldr", "LeftForeArm": "lForeArm", "LeftHand": "lHand",
+    "RightShoulder": "rCollar", "RightArm": "rShldr", "RightForeArm": "rForeArm", "RightHand": "rHand",
+}  # fmt: skip
+_LIMBS = {
+    "LeftUpLeg": "LeftLeg", "LeftLeg": "LeftFoot", "RightUpLeg": "RightLeg", "RightLeg": "RightFoot",
+    "LeftArm": "LeftForeArm", "LeftForeArm": "LeftHand", "RightArm": "RightForeArm", "RightForeArm": "RightHand",
+}  # fmt: skip
+_READERS = {".bvh": (read_bvh, bvh_length), ".npz": (read_amass, amass_length)}
+_FASTEST_ROOT = 12.0  # [m/s]; a sprinter's
+_FASTEST_BONE = 1800.0  # [degrees/s]; twice a runner's shin
+
+
+def list_clips(folder: str | Path) -> list[Path]:
+    """The clips in a folder (.bvh and .npz files, not those in folders below), sorted by name; none is opened."""
+    return sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in _READERS and p.is_file())
+
+
+def read_clip(path: str | Path) -> Clip:
+    """Reads a clip by its suffix: .bvh or AMASS .npz.
+
+    Raises:
+        MeshError: Another suffix, or a file that is damaged.
+    """
+    return _reader(path)[0](path)
+
+
+def clip_frames(path: str | Path, fps: float = 30.0) -> int:
+    """Frames that a clip has after :func:`retarget` to a frame rate; only the file's header is read.
+
+    Raises:
+        MeshError: Another suffix, or no header.
+    """
+    frames, rate = _reader(path)[1](path)
+    return resampled_length(frames, rate, fps)
+
+
+def _reader(path: str | Path):
+    path = Path(path)
+    if path.suffix.lower() not in _READERS:
+        raise MeshError(f"{path.name}: motions are read from .bvh and AMASS .npz files, not from {path.suffix!r}.")
+    return _READERS[path.suffix.lower()]
+
+
+def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
+    """The clip on another body, resampled to `fps`.
+
+    Raises:
+        MeshError: The clip's joints are named neither as CMU MotionBuilder nor as DAZ names them.
+    """
+    source = {name: name if name in clip.names else _DAZ.get(name) for name in body.bone_names}
+    source = {name: s if s in clip.names else None for name, s in source.items()}
+    missing = [name for name in ("Hips", *_LIMBS) if source[name] is None]
+    if missing:
+        raise MeshError(
+            f"{len(missing)} bones have no joint in the clip (first: {missing[0]}); its joints are "
+            f"{', '.join(clip.names[:6])}, ... Names of the CMU MotionBuilder or DAZ releases are understood."
+        )
+    clip = resampled(clip, fps)
+    rotations = np.empty((len(clip), len(body.bone_names), 3, 3))
+    alignment = {a: _limb_alignment(clip, body, source, a, b) for a, b in _LIMBS.items()}
+    alignment |= {"LeftHand": alignment["LeftForeArm"], "RightHand": alignment["RightForeArm"]}
+    for bone, name in enumerate(body.bone_names):
+        joint = source[name]
+        if joint is None:
+            rotations[:, bone] = rotations[:, body.bone_parents[bone]]
+        else:
+            rotations[:, bone] = clip.rotations[:, clip.names.index(joint)] @ alignment.get(name, np.eye(3))
+    return PoseSequence(rotations, clip.root * _leg_ratio(clip, body, source), fps)
+
+
+def jumps(body: RestBody, poses: PoseSequence) -> np.ndarray:
+    """Frames to which the body cannot have moved from the frame before, bool [T]: markers were lost or swapped.
+
+    The root is faster than 12 m/s, or a bone of the trunk, head, thighs, shins or arms than 1,800 degrees a second.
+    Hands, feet and toes, whose few markers often flicker, move little cloth and may.
+    """
+    carried = {b for name in ("Hand", "Foot") for side in ("Left", "Right") for b in body.chain(side + name)}
+    bones = [b for b in range(len(body.bone_names)) if b not in carried]
+    relative = poses.rotations[:-1, bones].transpose(0, 1, 3, 2) @ poses.rotations[1:, bones]
+    cosine = 0.5 * (np.trace(relative, axis1=2, axis2=3).min(axis=1, initial=3.0) - 1.0)
+    turned = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    moved = np.linalg.norm(np.diff(poses.root, axis=0), axis=1)
+    too_fast = (turned > _FASTEST_BONE / poses.fps) | (moved > _FASTEST_ROOT / poses.fps)
+    return np.concatenate([[False], too_fast])
+
+
+def _limb_alignment(clip: Clip, body: RestBody, source, bone: str, child: str) -> np.ndarray:
+    """Smallest rotation from the target's rest direction of a limb to the source's zero-pose direction."""
+    a = body.joint(child) - body.joint(bone)
+    b = clip.offsets[clip.names.index(source[child])]
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-9:
+        return np.eye(3)
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, a @ b)).as_matrix()
+
+
+def _leg_ratio(clip: Clip, body: RestBody, source) -> float:
+    bones = ("LeftUpLeg", "LeftLeg", "LeftFoot")
+    target = sum(np.linalg.norm(body.joint(b) - body.joint(a)) for a, b in itertools.pairwise(bones))
+    own = sum(np.linalg.norm(clip.offsets[clip.names.index(source[b])]) for b in bones[1:])
+    return float(target / own)

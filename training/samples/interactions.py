@@ -1,0 +1,180 @@
+"""What a garment sees of its body, computed once per sequence and kept beside the data.
+
+Closest points and signs depend on the recorded garment, not on the network, and slightly moved garments may reuse them
+(`kernels.features.face_features` recomputes the distance from the closest point). So the signed-distance queries, by
+far the dearest part of a training sample, are done once for every frame t in 0..T-2 and stored as one memory-mapped
+array
+
+    interaction.npy   float32 [T-1, F, 16]   columns: see COLUMNS; row t holds the body's motion from frame t to t + 1
+    geodesics.npy     float32 [F, F]         metres, inf across components; garments beyond 10,000 faces have none
+
+in a folder named after the sequence and the checksum of everything that went in (array files, versions). A folder is
+written under another name and renamed when complete, so that what exists is whole.
+
+    python -m warpgarment.training.samples.interactions DATA [CACHE]        # fills the cache before a training run
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import warpgarment
+from warpgarment.kernels.deformation.gradients import face_centroids
+from warpgarment.kernels.features.face import BodyInteraction, body_interaction
+from warpgarment.kernels.sdf.bodies import BodyMeshes
+
+CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
+WIDTH = 16
+COLUMNS = {"closest": slice(0, 3), "sign": 3, "deformation": slice(4, 13), "velocity": slice(13, 16)}
+_SOURCES = (
+    "garment_rest_vertices", "garment_faces", "garment_vertices", "body_rest_vertices", "body_faces", "collider_faces",
+    "bone_indices", "bone_weights", "bone_transforms",
+)  # fmt: skip
+_SOURCES_2 = (
+    "garment_positions", "garment_boxes", "body_rest_positions", "body_rest_box", "bone_rotations", "bone_translations",
+    "bone_origins", "body_positions", "body_boxes",
+)  # fmt: skip
+
+
+class UnusableSequence(ValueError):
+    """A sequence that cannot be trained on; the message says why."""
+
+
+def default_cache(data: Path) -> Path:
+    """The cache folder beside a data folder: `sequences` -> `sequences.cache`."""
+    data = Path(data).resolve()
+    return data.parent / f"{data.name}.cache"
+
+
+def key_of(folder: Path) -> str:
+    """Checksum of the arrays and versions that the cached values depend on."""
+    digest = hashlib.sha256(f"{CACHE_VERSION} {getattr(warpgarment, '__version__', '')}".encode())
+    for name in _SOURCES:
+        path = Path(folder) / f"{name}.npy"
+        digest.update(name.encode())
+        digest.update(path.read_bytes() if path.exists() else b"-")
+    for name in _SOURCES_2:  # where there is none, the key is that of format 1
+        path = Path(folder) / f"{name}.npy"
+        if path.exists():
+            digest.update(name.encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def compute(sequence, device: torch.device | str = "cpu") -> np.ndarray:
+    """Body interaction of every face in every frame but the last.
+
+    Args:
+        sequence: A `dataset.Sequence` (or anything with `.garment`, `.vertices` and `.body()`).
+        device: Where the queries run.
+
+    Returns:
+        float32 [T-1, F, 16], columns as in COLUMNS.
+    """
+    device = torch.device(device)
+    faces = torch.as_tensor(np.ascontiguousarray(sequence.garment.faces), dtype=torch.int32, device=device)
+    body = sequence.body()
+    body_vertices = torch.as_tensor(np.asarray(body.vertices, np.float32), device=device)
+    body_faces = torch.as_tensor(np.asarray(body.faces, np.int32), device=device)
+    frames = min(len(sequence.vertices), len(body_vertices))
+    out = np.empty((frames - 1, len(faces), WIDTH), np.float32)
+    meshes = BodyMeshes(body_vertices[0].contiguous(), body_faces)
+    for t in range(frames - 1):
+        if t:
+            meshes.update(body_vertices[t].contiguous())
+        vertices = torch.as_tensor(np.array(sequence.vertices[t], np.float32), device=device)
+        found = body_interaction(face_centroids(vertices, faces), None, meshes, body_vertices[t + 1].contiguous())
+        out[t] = pack(found).cpu().numpy()
+    return out
+
+
+def pack(found: BodyInteraction) -> torch.Tensor:
+    """BodyInteraction of F faces -> [F, 16], without the index of the body face."""
+    return torch.cat(
+        [found.closest, found.sign[:, None].to(torch.float32), found.deformation.reshape(-1, 9), found.velocity], dim=1
+    )
+
+
+def unpack(rows: torch.Tensor) -> BodyInteraction:
+    """[N, 16] -> BodyInteraction with body face -1 (what the feature kernel needs is all here)."""
+    none = torch.full((len(rows),), -1, dtype=torch.int32, device=rows.device)
+    return BodyInteraction(
+        closest=rows[:, COLUMNS["closest"]].contiguous(),
+        sign=rows[:, COLUMNS["sign"]].contiguous(),
+        face=none,
+        deformation=rows[:, COLUMNS["deformation"]].reshape(-1, 3, 3).contiguous(),
+        velocity=rows[:, COLUMNS["velocity"]].contiguous(),
+    )
+
+
+def cached(
+    sequence, folder: Path, cache: Path, device: torch.device | str = "cpu"
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Loads a sequence's interactions and geodesics from the cache, computing and storing them first where need be.
+
+    Args:
+        sequence: The loaded sequence.
+        folder: Where it was loaded from.
+        cache: Cache root; made if missing.
+        device: Where missing values are computed.
+
+    Returns:
+        Memory maps: interaction float32 [T-1, F, 16] and geodesics float32 [F, F]; None for garments that pool theirs.
+
+    Raises:
+        UnusableSequence: The values are not finite.
+    """
+    cache = Path(cache)
+    place = cache / f"{Path(folder).name}-{key_of(folder)}"
+    if not (place / "manifest.json").exists():
+        interaction = compute(sequence, device)
+        if not np.isfinite(interaction).all():
+            raise UnusableSequence("body interaction is not finite (degenerate body faces or NaN in the body motion)")
+        cache.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=".writing-", dir=cache))
+        try:
+            np.save(temporary / "interaction.npy", interaction)
+            if not sequence.garment.pools:
+                np.save(temporary / "geodesics.npy", np.asarray(sequence.garment.geodesics, np.float32))
+            manifest = {"cache_version": CACHE_VERSION, "device": str(device)}
+            (temporary / "manifest.json").write_text(json.dumps(manifest))
+            try:
+                os.replace(temporary, place)
+            except OSError:  # another process was first, or what lies there is incomplete
+                if not (place / "manifest.json").exists():
+                    shutil.rmtree(place)
+                    os.replace(temporary, place)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    interaction = np.load(place / "interaction.npy", mmap_mode="r")
+    if sequence.garment.pools:
+        return interaction, None
+    return interaction, np.load(place / "geodesics.npy", mmap_mode="r")
+
+
+def main(arguments: list[str]) -> None:
+    """Fills the cache of a data folder; prints one line per sequence that cannot be used."""
+    from warpgarment.training.data.sequence import Sequence, list_sequences
+
+    data = Path(arguments[0])
+    cache = Path(arguments[1]) if len(arguments) > 1 else default_cache(data)
+    for folder in list_sequences(data):
+        try:
+            cached(Sequence.load(folder), folder, cache)
+        except (ValueError, OSError) as error:
+            print(f"skipped {folder.name}: {error}")
+            continue
+        print(folder.name)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

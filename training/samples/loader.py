@@ -1,0 +1,155 @@
+"""Which samples make up which step, and the thread that builds them ahead of the training loop.
+
+Everything about step n follows from (seed, n): the epoch's order, the subsets of faces, the noise. So a resumed run
+sees the same batches as one that never stopped, and how far ahead the thread runs does not matter.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+
+from .pushforward import Pool
+from .single_step import Batch, SampleBuilder
+
+
+class Plan:
+    """Which samples make up which batch: every sample once an epoch, batches of garments of similar size.
+
+    Args:
+        sizes: Faces of each sequence's garment.
+        counts: Samples of each sequence.
+        batch_size: Samples per batch.
+        seed: Of the order.
+    """
+
+    def __init__(self, sizes: list[int], counts: list[int], batch_size: int, seed: int) -> None:
+        self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
+        self._samples = np.concatenate([np.stack([np.full(n, s), np.arange(n)], 1) for s, n in enumerate(counts)])
+        self.batches = max(len(self._samples) // batch_size, 1)  # per epoch
+        self._epoch, self._order = -1, self._samples
+
+    def picks(self, step: int) -> list[tuple[int, int]]:
+        """Sequence index and newest frame of each sample of a step."""
+        epoch = step // self.batches
+        if epoch != self._epoch:
+            rng = np.random.default_rng((self.seed, epoch))
+            order = rng.permutation(len(self._samples))
+            if len(order) < self.batch_size:
+                order = np.resize(order, self.batch_size)
+            window = 16 * self.batch_size  # sorted by size within a window only, so that company changes
+            parts = np.split(order, range(window, len(order), window))
+            by_size = [part[np.argsort(self.sizes[self._samples[part, 0]], kind="stable")] for part in parts]
+            order = np.concatenate(by_size)[: self.batches * self.batch_size].reshape(self.batches, self.batch_size)
+            self._epoch, self._order = epoch, self._samples[order[rng.permutation(self.batches)]]
+        return [(int(s), int(t)) for s, t in self._order[step % self.batches]]
+
+
+class Loader:
+    """Builds the batches of steps, in a thread of its own, `depth` ahead.
+
+    Args:
+        builder: Builds a batch.
+        plan: Says which samples.
+        pool: What the network's own rollouts did wrong, mixed in as `share` of the samples.
+        share: Share of samples from the pool, where it has any that fit.
+        splits: Number of subsets that a garment's faces are split into at a step; one of them is used. At 1, a
+            network of patches is shown whole garments, others as much of each as its batch's smallest has.
+        depth: Batches built ahead; 0 builds them when asked, without a thread.
+        part: The samples of each batch that this process trains on.
+    """
+
+    def __init__(
+        self,
+        builder: SampleBuilder,
+        plan: Plan,
+        pool: Pool,
+        share: float,
+        splits: Callable[[int], int],
+        depth: int = 3,
+        part: slice = slice(None),
+    ) -> None:
+        self.builder, self.plan, self.pool, self.share = builder, plan, pool, share
+        self.splits, self.depth, self.part = splits, depth, part
+        # A stream of its own: what a batch waits for is not the training step, nor the other way round
+        self._stream = torch.cuda.Stream(builder.device) if builder.device.type == "cuda" else None
+
+    def build(self, step: int, *, splits: int | None = None, part: slice | None = None) -> Batch:
+        """The batch of a step; `splits` and `part` override the schedule's and the process's."""
+        rng = np.random.default_rng((self.plan.seed, 1, step))
+        picks = self.plan.picks(step)
+        splits = self.splits(step) if splits is None else splits
+        sizes = [int(self.plan.sizes[s]) for s, _ in picks]
+        whole = self.builder.patches and splits == 1
+        faces = max(sizes) if whole else max(min(sizes) // splits, 1)
+        displacements: list[np.ndarray | None] = [None] * len(picks)
+        fitting = self.pool.fitting(self.plan.sizes, faces, whole=whole)
+        fitting = [entry for entry in fitting if self._reaches(*entry)]
+        for b in range(len(picks)):
+            if len(fitting) and rng.random() < self.share:
+                s, t, displacements[b] = self.pool.entry(*fitting[rng.integers(len(fitting))])
+                picks[b] = (s, t)
+        return self.builder.build(
+            picks, None if whole else faces, rng, displacements, self.part if part is None else part
+        )
+
+    def _reaches(self, rollout: int, last: int) -> bool:
+        """Whether enough recorded frames follow a frame of the pool."""
+        return self.builder.reaches(*self.pool.entry(rollout, last)[:2])
+
+    def batches(self, start: int, stop: int) -> Iterator[Batch]:
+        """The batches of steps start..stop-1, in order."""
+        if self.depth == 0:
+            yield from map(self.build, range(start, stop))
+            return
+        if self._stream:
+            self._stream.wait_stream(torch.cuda.current_stream(self.builder.device))
+        ready: queue.Queue = queue.Queue(maxsize=self.depth)
+        stopped = threading.Event()
+
+        def hand_over(item: tuple[Batch, torch.cuda.Event | None] | BaseException) -> bool:
+            while not stopped.is_set():
+                try:
+                    ready.put(item, timeout=0.2)
+                    return True
+                except queue.Full:
+                    continue
+            return False
+
+        def work() -> None:
+            try:
+                with torch.cuda.stream(self._stream):  # of None: nothing
+                    for step in range(start, stop):
+                        batch = self.build(step)
+                        if not hand_over((batch, self._stream.record_event() if self._stream else None)):
+                            return
+            except BaseException as error:  # raised where the batch is asked for
+                hand_over(error)
+
+        thread = threading.Thread(target=work, name="warpgarment-loader", daemon=True)
+        thread.start()
+        try:
+            for _ in range(start, stop):
+                item = ready.get()
+                if isinstance(item, BaseException):
+                    raise item
+                batch, built = item
+                if built is not None:
+                    _adopt(batch, built)
+                yield batch
+        finally:
+            stopped.set()
+            thread.join()
+
+
+def _adopt(batch: Batch, built: torch.cuda.Event) -> None:
+    """Makes the current stream wait for a batch of another one, and its memory wait for the current stream."""
+    stream = torch.cuda.current_stream(batch.features.device)
+    stream.wait_event(built)
+    for tensor in torch.utils._pytree.tree_leaves(tuple(batch)):
+        if isinstance(tensor, torch.Tensor):
+            tensor.record_stream(stream)

@@ -1,0 +1,132 @@
+"""What the network's own rollouts do wrong, as displacements of recorded frames that training samples can start from.
+
+A few short rollouts start from recorded history (or cold, from frame 0) at random places of the training set. After k
+steps the newest k frames differ from the recorded ones by what the network did wrong; these differences override the
+newest frames of a sample's history, whose answer then leads back to the recorded motion. The pool is refreshed every
+so many steps; between refreshes it does not change, and it is part of the saved training state, so that resumed runs
+see the same samples. Several processes share the rollouts, and all get all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warpgarment.training.distributed import Group
+from warpgarment.training.rollouts import predict
+
+
+@dataclass(frozen=True)
+class PushforwardConfig:
+    """Settings of the pool.
+
+    Attributes:
+        share: Share of training samples that start from the pool; 0, the default, switches it off: at the budgets that
+            were tried, it made rollouts worse (benchmarks/results/recipe.md).
+        steps: Length of each rollout in frames.
+        rollouts: Number of rollouts in the pool.
+        every: Training steps between refreshes; the first comes after as many steps.
+        cold: Share of rollouts that start cold at frame 0.
+        limit: Frames whose mean displacement exceeds this [m] are dropped: too far off for a one-step answer.
+    """
+
+    share: float = 0.0
+    steps: int = 8
+    rollouts: int = 24
+    every: int = 500
+    cold: float = 0.25
+    limit: float = 0.05
+
+
+class Pool:
+    """Rollouts as (sequence index, first predicted frame, displacements [K,V,3] in metres)."""
+
+    def __init__(self) -> None:
+        self.rollouts: list[tuple[int, int, np.ndarray]] = []
+        self.step = 0  # of the last refresh
+
+    def fitting(self, sizes: np.ndarray, faces: int, *, whole: bool = False) -> list[tuple[int, int]]:
+        """All (rollout, last frame index) whose garment has at least `faces` faces, or `whole` at most."""
+        return [
+            (r, k)
+            for r, (s, _, displacement) in enumerate(self.rollouts)
+            if (sizes[s] <= faces if whole else sizes[s] >= faces)
+            for k in range(len(displacement))
+        ]
+
+    def entry(self, rollout: int, last: int, history: int = 10) -> tuple[int, int, np.ndarray]:
+        """Sequence, newest frame, and displacements of the newest frames [<=history,V,3], oldest first."""
+        sequence, first, displacement = self.rollouts[rollout]
+        return sequence, first + last, displacement[max(0, last + 1 - history) : last + 1]
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """For saving."""
+        saved = {}
+        for r, (s, first, displacement) in enumerate(self.rollouts):
+            saved[f"pool.{r}.displacement"] = torch.from_numpy(np.ascontiguousarray(displacement))
+            saved[f"pool.{r}.place"] = torch.tensor([s, first])
+        return saved
+
+    def restore(self, tensors: dict[str, torch.Tensor]) -> None:
+        """From what `tensors` gave."""
+        self.rollouts = []
+        while f"pool.{len(self.rollouts)}.place" in tensors:
+            r = len(self.rollouts)
+            s, first = tensors[f"pool.{r}.place"].tolist()
+            self.rollouts.append((s, first, tensors[f"pool.{r}.displacement"].numpy()))
+
+    def refresh(
+        self, simulator, sequences: list, config: PushforwardConfig, rng: np.random.Generator, group: Group
+    ) -> float:
+        """Fills the pool anew.
+
+        Args:
+            simulator: A `Simulator` around the network as it is now.
+            sequences: `SequenceData`, with their `source` sequences.
+            config: Settings.
+            rng: Chooses the places, the same in all processes.
+            group: The processes that share the work.
+
+        Returns:
+            Mean vertex error after the last step [m], over the rollouts that stayed finite; NaN if none did.
+        """
+        places = self._places(sequences, config, rng, simulator.network.config.history)
+        found = []
+        for number, (s, newest, steps, cold) in enumerate(places):
+            data = sequences[s]
+            displacement = np.zeros((steps, *data.vertices.shape[1:]), np.float32)
+            if number % group.size == group.rank:
+                recorded = data.vertices[newest + 1 : newest + 1 + steps].cpu().numpy()
+                predicted = predict(simulator, data.source, newest, steps, cold=cold, body=data.body)
+                displacement = (predicted - recorded).astype(np.float32)
+            found.append(displacement)
+        rollouts, errors = [], []
+        for number, ((s, newest, steps, _), displacement) in enumerate(zip(places, found, strict=True)):
+            group.broadcast(torch.from_numpy(displacement), number % group.size)
+            error = np.linalg.norm(displacement, axis=-1).mean(axis=1)
+            good = np.isfinite(error) & (error < config.limit)
+            keep = steps if good.all() else int(np.argmin(good))
+            errors.append(error[-1])
+            if keep:
+                rollouts.append((s, newest + 1, displacement[:keep]))
+        self.rollouts = rollouts
+        finite = [e for e in errors if np.isfinite(e)]
+        return float(np.mean(finite)) if finite else float("nan")
+
+    @staticmethod
+    def _places(
+        sequences: list, config: PushforwardConfig, rng: np.random.Generator, history: int
+    ) -> list[tuple[int, int, int, bool]]:
+        """Where rollouts start: sequence, newest recorded frame, steps, and whether from that frame alone."""
+        places = []
+        for _ in range(config.rollouts):
+            s = int(rng.integers(len(sequences)))
+            data = sequences[s]
+            cold = bool(rng.random() < config.cold) or data.count <= history
+            newest = 0 if cold else int(rng.integers(history - 1, data.count))
+            steps = min(config.steps, data.count - 1 - newest)  # the frame after the last one is a target
+            if steps >= 1:
+                places.append((s, newest, steps, cold))
+        return places

@@ -1,0 +1,262 @@
+"""Training samples: histories of perturbed garments, as the network will meet them in a rollout, and what it should
+answer.
+
+A sample is a sequence and its newest history frame t; the target is frame t + 1. Frames before the first repeat it,
+with a body at rest, exactly as a cold start does. Garment positions of the history are displaced (by `noise`, or by
+what a rollout of the network itself did wrong), and everything is recomputed from the displaced positions, the answer
+too:
+
+    Psi = Phi_{t+1} (Phi~_t)^-1      Sigma = Sigma_{t+1}      q = z_{t+1} - z~_t            (~ displaced)
+
+so the answer leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces
+and frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but
+components. A network of patches is shown neighbours where the faces are not a subset: then whole garments make a batch,
+padded with copies of a face that do not count.
+
+Every sample has a stream of random numbers of its own, so that a part of a batch is the same part whoever builds it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
+from warpgarment.kernels.deformation.svd import singular_values
+from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.heading import rotation_about_up
+from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
+from warpgarment.nn.patches.layout import Patches, PatchLayout, patch_layout
+from warpgarment.training.flops import step_flops
+
+from .augmentation import Augmentation, mirror
+from .interactions import COLUMNS, unpack
+from .noise import NoiseConfig
+from .recorded import SequenceData
+
+__all__ = ["Augmentation", "Batch", "SampleBuilder", "SequenceData", "mirror"]
+
+
+class Batch(NamedTuple):
+    """Training samples; lengths in metres, in the network's frame (turned to its heading, mirrored, as the settings
+    say)."""
+
+    features: torch.Tensor  # [B,N,H*34] oldest first
+    velocities: torch.Tensor  # [B,C,(H-1)*3]
+    weights: torch.Tensor | PatchLayout  # [B,N,N] geodesic; or patches
+    velocity_mask: torch.Tensor | None  # [B,C] bool; None where all garments have C components
+    components: torch.Tensor  # scalar: garment components of the whole batch, times the share of it that this is
+    target: NetworkOutput  # what the network should say
+    ids: list[tuple[str, int]]  # sequence, newest frame
+    face_mask: torch.Tensor | None = None  # [B,N] bool; None where all are real
+    faces: torch.Tensor | None = None  # scalar, as `components`, of real faces; None where all are
+
+    def work(self, config: NetworkConfig) -> tuple[int, int]:
+        """Samples, and operations of a training step on them (`flops.py`)."""
+        samples, faces = self.features.shape[:2]
+        patches = self.weights.start.shape[1] if isinstance(self.weights, PatchLayout) else 0
+        return samples, step_flops(config, samples, faces, self.velocities.shape[1], patches)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What is kept of a batch whose loss is not finite."""
+        weights = self.weights.weights if isinstance(self.weights, PatchLayout) else self.weights
+        tensors = {"features": self.features, "velocities": self.velocities, "weights": weights}
+        return {name: tensor.cpu().numpy() for name, tensor in (tensors | self.target._asdict()).items()}
+
+
+class SampleBuilder:
+    """Builds batches.
+
+    Args:
+        sequences: Training sequences.
+        network: Their `NetworkConfig`.
+        noise: Perturbation of histories.
+        augmentation: Mirror, turns and sizes.
+    """
+
+    def __init__(self, sequences: list[SequenceData], network, noise: NoiseConfig, augmentation: Augmentation) -> None:
+        self.sequences, self.network = sequences, network
+        self.noise, self.augmentation = noise, augmentation
+        self.device = sequences[0].device
+        self.patches = network.architecture == "patches"
+
+    def reaches(self, sequence: int, newest: int) -> bool:
+        """Whether the recorded frames that a sample needs follow a frame."""
+        return newest < self.sequences[sequence].count
+
+    @torch.no_grad()
+    def build(
+        self,
+        picks: list[tuple[int, int]],
+        faces: int | None,
+        rng: np.random.Generator,
+        displacements: list[np.ndarray | None] | None = None,
+        part: slice = slice(None),
+    ) -> Batch:
+        """Builds one batch, or a part of it.
+
+        Args:
+            picks: Sequence index and newest frame of each sample.
+            faces: Number N of faces per sample, a random subset; every garment has as many. For a network of patches
+                also None: all of every garment.
+            rng: All randomness comes from here: sample b draws from the b-th stream it spawns.
+            displacements: Per sample None or [K,V,3] metres, K <= history: an override of the newest K frames, relative
+                to the recorded positions; noise comes on top.
+            part: The samples to build.
+
+        Returns:
+            The batch, on the sequences' device.
+        """
+        all_faces = sum(len(self.sequences[s].faces) if faces is None else faces for s, _ in picks)
+        streams, whole = rng.spawn(len(picks))[part], [self.sequences[s].components for s, _ in picks]
+        picks, real = picks[part], whole[part]
+        displacements = displacements[part] if displacements else [None] * len(picks)
+        history, device, count, components = self.network.history, self.device, len(picks), max(real)
+        sizes = [len(self.sequences[s].faces) if faces is None else faces for s, _ in picks]
+        whole_garments, faces = faces is None, max(sizes)
+        turn, similarity, joint, mirrored, scale = self._drawn(picks, streams)
+
+        positions, following, corners, next_corners, means = [], [], [], [], []
+        rows = torch.empty(count, faces, history, 16, device=device)
+        inverse_rest = torch.empty(count, faces, 3, 3, device=device)
+        weights = None if self.patches else torch.empty(count, faces, faces, device=device)
+        shown: list[Patches] = []
+        velocities = torch.zeros(count, components, (history - 1) * 3, device=device)
+        velocity = torch.zeros(count, components, 3, device=device)
+        body_velocity = torch.zeros(count, components, 3, device=device)
+        origin = torch.empty(count, 1, 3, device=device)
+        start, next_start = 0, 0
+        for b, (s, t) in enumerate(picks):
+            sequence, rng = self.sequences[s], streams[b]
+            if whole_garments:
+                subset = np.arange(faces)
+                subset[sizes[b] :] = 0
+            else:
+                subset = np.sort(rng.permutation(len(sequence.faces))[:faces])
+            if self.patches:
+                shown.append(sequence.patches if whole_garments else sequence.patches.subset(subset))
+            if weights is not None:
+                weights[b] = sequence.weights(subset, scale[b])
+            subset = self._send(subset)
+            frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
+            past = sequence.vertices[frames]
+            delta = self.displacement(sequence, rng, displacements[b])
+            if delta is not None:
+                first = max(history - 1 - t, 0)  # frames before the first repeat it, displaced as it is
+                past = past + self._send(delta[np.maximum(np.arange(history), first)])
+            mean = sequence.garment_weights @ past[-1]
+            origin[b] = mean
+            past = (past - mean) @ similarity[b].mT
+            after = (sequence.vertices[t + 1] - mean) @ similarity[b].mT
+            centres = torch.einsum("cv,hvk->hck", sequence.component_weights, past)
+            velocities[b, : sequence.components] = (centres[1:] - centres[:-1]).transpose(0, 1).flatten(1)
+            velocity[b, : sequence.components] = sequence.component_weights @ after - centres[-1]
+            body_velocity[b, : sequence.components] = sequence.body_velocity[t] @ similarity[b].mT
+            rows[b] = sequence.interaction[frames[None, :], subset[:, None]]
+            early = max(history - 1 - t, 0)
+            if early:
+                rows[b, :, :early, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
+                rows[b, :, :early, COLUMNS["velocity"]] = 0.0
+            inverse_rest[b] = sequence.inverse_rest[subset]
+            chosen, vertices = sequence.faces[subset], past.shape[1]
+            steps = torch.arange(history, dtype=torch.int32, device=device) * vertices + start
+            corners.append(chosen[:, None, :] + steps[None, :, None])
+            next_corners.append(chosen + next_start)
+            positions.append(past.reshape(-1, 3))
+            following.append(after)
+            means.append(sequence.garment_weights @ past)
+            start, next_start = start + history * vertices, next_start + vertices
+
+        if self.augmentation.yaw:
+            inverse_rest = inverse_rest @ joint[:, None].mT
+        if self.augmentation.scale:  # edges are longer, normals are not
+            inverse_rest[:, :, :2] /= self._send(scale)[:, None, None, None]
+        self._turn(rows, turn, similarity, origin)
+        stacked = inverse_rest[:, :, None].expand(-1, -1, history, -1, -1).reshape(-1, 3, 3)
+        garment = torch.arange(count * history, dtype=torch.int32, device=device).reshape(count, 1, history)
+        features = face_features(
+            stacked, torch.cat(positions), torch.cat(corners).reshape(-1, 3),
+            garment.expand(-1, faces, -1).reshape(-1).contiguous(), torch.cat(means), unpack(rows.reshape(-1, 16)),
+        ).reshape(count, faces, history * FEATURES)  # fmt: skip
+        phi_next = deformation_gradient_from_inverse(
+            inverse_rest.reshape(-1, 3, 3), torch.cat(following), torch.cat(next_corners)
+        )
+        phi = features[..., -FEATURES:][..., LAYOUT["deformation_gradient"]].reshape(-1, 3, 3).contiguous()
+        step = Step(
+            relative_deformation_gradient(phi_next, phi).reshape(count, faces, 3, 3),
+            singular_values(phi_next).reshape(count, faces, 3),
+            velocity,
+        )
+        face_component = torch.zeros(count, faces, dtype=torch.int64, device=device)
+        newest = context(features, face_component, 1)._replace(body_velocity=body_velocity)
+        target = targets(step, newest, residual=self.network.residual)
+        if mirrored.any():
+            features, velocities, target = mirror(features, velocities, target, self._send(mirrored))
+        mask = None
+        if min(real) < components:
+            mask = self._send(np.arange(components)[None] < np.array(real)[:, None])
+        share = torch.full((), sum(whole) * count / len(whole), device=device)
+        ids = [(self.sequences[s].name, t) for s, t in picks]
+        if weights is not None:
+            return Batch(features, velocities, weights, mask, share, target, ids)
+        layout = patch_layout(shown, self.network.geodesic_radius, self.network.geodesic_power, device, scale)
+        face_mask = None
+        if min(sizes) < faces:
+            face_mask = self._send(np.arange(faces)[None] < np.array(sizes)[:, None])
+        total = torch.full((), all_faces * count / len(whole), device=device)
+        return Batch(features, velocities, layout, mask, share, target, ids, face_mask, total)
+
+    def _drawn(
+        self, picks: list[tuple[int, int]], streams: list[np.random.Generator]
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, np.ndarray, np.ndarray]:
+        """Per sample: turn of the world [B,3,3], the same times its scale, the part of the turn that the rest pose
+        shares, whether it is mirrored [B], and its scale [B]."""
+        settings, count = self.augmentation, len(picks)
+        canonical = self.network.heading == "canonical"
+        angles = np.zeros((2, count), np.float32)  # of the world, of world and rest together
+        mirrored, scale = np.zeros(count, bool), np.ones(count, np.float32)
+        for b, rng in enumerate(streams):
+            angles[1, b] = rng.standard_normal() * np.radians(settings.yaw)
+            angles[0, b] = rng.uniform(-np.pi, np.pi)
+            mirrored[b] = rng.random() < settings.mirror
+            scale[b] = 1.0 + settings.scale * rng.uniform(-1.0, 1.0)
+        world, both = self._send(angles)
+        if canonical:
+            world = -torch.stack([self.sequences[s].yaw[t] for s, t in picks])
+        elif not settings.world_yaw:
+            world = torch.zeros_like(world)
+        joint = rotation_about_up(both)
+        turn = joint @ rotation_about_up(world)
+        return turn, turn * self._send(scale)[:, None, None], joint, mirrored, scale
+
+    def _send(self, array: np.ndarray) -> torch.Tensor:
+        """A copy on the device; from pinned memory, so that nothing waits for it."""
+        values = torch.from_numpy(np.ascontiguousarray(array))
+        if self.device.type != "cuda":
+            return values.to(self.device)
+        return values.pin_memory().to(self.device, non_blocking=True)
+
+    def displacement(
+        self, sequence: SequenceData, rng: np.random.Generator, override: np.ndarray | None
+    ) -> np.ndarray | None:
+        """[history,V,3]: noise plus the override of the newest frames; None where there is neither."""
+        delta = sequence.noise.displacement(self.network.history, self.noise, rng)
+        if override is not None:
+            if delta is None:
+                delta = np.zeros((self.network.history, *override.shape[1:]), np.float32)
+            delta[-len(override) :] += override
+        return delta
+
+    @staticmethod
+    def _turn(rows: torch.Tensor, turn: torch.Tensor, similarity: torch.Tensor, origin: torch.Tensor) -> None:
+        """Turns (and scales) interactions [B,N,H,16] in place, about each garment's origin."""
+        back = similarity.mT
+        flat = rows.flatten(1, 2)
+        flat[..., COLUMNS["closest"]] = (flat[..., COLUMNS["closest"]] - origin) @ back
+        flat[..., COLUMNS["velocity"]] = flat[..., COLUMNS["velocity"]] @ back
+        # (G D G^T) row-major is (G kron G) applied to D row-major
+        both = torch.einsum("bij,bkl->bikjl", turn, turn).reshape(-1, 9, 9)
+        flat[..., COLUMNS["deformation"]] = flat[..., COLUMNS["deformation"]] @ both.mT

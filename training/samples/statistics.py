@@ -1,0 +1,41 @@
+"""Means and standard deviations that a network normalises its inputs and outputs with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+
+from warpgarment.kernels.features.face import FEATURES
+from warpgarment.nn.network import GarmentNetwork
+
+from .single_step import Batch
+
+FLOORS = {"feature": 3e-3, "velocity": 1e-3, "psi": 1e-3, "singular_value": 1e-3, "q": 3e-4}
+
+
+def statistics(batches: Iterable[Batch], network: GarmentNetwork) -> dict[str, torch.Tensor]:
+    """Means and standard deviations of inputs and targets over some batches.
+
+    Residual outputs keep the means that stand for skin; deviations have floors, so that numbers which hardly vary (a
+    body at rest, a singular value that is always one) are not blown up.
+    """
+    samples: dict[str, list[torch.Tensor]] = {name: [] for name in FLOORS}
+    for batch in batches:
+        faces = slice(None) if batch.face_mask is None else batch.face_mask
+        samples["feature"].append(batch.features[faces].reshape(-1, FEATURES))
+        real = slice(None) if batch.velocity_mask is None else batch.velocity_mask
+        samples["velocity"].append(batch.velocities[real].reshape(-1, 3))
+        samples["psi"].append(batch.target.psi[faces].reshape(-1, 9))
+        samples["singular_value"].append(batch.target.singular_values[faces].reshape(-1, 3))
+        samples["q"].append(batch.target.velocity[real].reshape(-1, 3))
+    found = {}
+    for name, parts in samples.items():
+        values = torch.cat(parts).double()
+        mean = values.mean(dim=0)
+        if network.config.residual and name in ("psi", "q"):
+            mean = torch.eye(3, dtype=torch.float64).flatten() if name == "psi" else torch.zeros(3, dtype=torch.float64)
+        deviation = (values - mean.to(values.device)).square().mean(dim=0).sqrt()
+        found[f"{name}_mean"] = mean.float()
+        found[f"{name}_std"] = deviation.clamp(min=FLOORS[name]).float()
+    return found

@@ -1,0 +1,208 @@
+"""Samples for unrolled training: whole garments on their bodies, K frames to go, as a `Scene` and its first state.
+
+A sample is a sequence and its newest history frame t, as in `samples.py`; the frames t+1..t+K are recorded answers. The
+history is displaced as there, and its features are computed from the displaced positions with cached nearest points.
+Everything stays in world space. Turns and mirrors are kept with the batch: the network sees turned and mirrored inputs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
+from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.heading import rotation_about_up
+from warpgarment.objects.pack import PackedBodies
+from warpgarment.sim.history import History
+from warpgarment.sim.scene import Scene
+from warpgarment.sim.timing import Timings
+from warpgarment.training.flops import step_flops
+
+from .augmentation import Augmentation
+from .interactions import COLUMNS, unpack
+from .noise import NoiseConfig
+from .recorded import SequenceData
+from .single_step import SampleBuilder
+
+_VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
+
+
+@dataclass(frozen=True)
+class UnrolledBatch:
+    """Unrolled samples, packed; lengths in metres, in world space."""
+
+    scene: Scene
+    vertices: torch.Tensor  # [V,3] of the newest history frame, displaced
+    history: History  # of the frames before it
+    features: torch.Tensor  # [F,34] of the newest frame
+    bodies: list[torch.Tensor]  # K+1 frames [U,3], of the newest frame first
+    recorded: list[torch.Tensor]  # K frames [V,3]
+    turn: torch.Tensor  # [B,3,3] of what the network sees, the world and the rest pose's together
+    joint: torch.Tensor  # [B,3,3] the part of it that the rest pose shares
+    mirrored: torch.Tensor  # bool [B]
+    face_weight: torch.Tensor  # [F] in a mean over samples of means over faces
+    vertex_weight: torch.Tensor  # [V]
+    components: torch.Tensor  # scalar: as `samples.Batch.components`
+    ids: list[tuple[str, int]]  # sequence, newest frame
+
+    def work(self, config: NetworkConfig) -> tuple[int, int]:
+        """Samples, and operations of a training step on them (`flops.py`)."""
+        each = [step_flops(config, *view.face_index.shape, view.component_index.shape[1]) for view in self.scene.views]
+        return len(self.ids), len(self.recorded) * sum(each)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What is kept of a batch whose loss is not finite."""
+        tensors = {"features": self.history.stacked(self.features), "velocities": self.history.velocities}
+        tensors |= {"vertices": self.vertices, "recorded": torch.stack(self.recorded), "faces": self.scene.packed.faces}
+        return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
+
+
+def turned(
+    features: torch.Tensor, velocities: torch.Tensor, turn: torch.Tensor, joint: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What a network sees of a turned world: v -> G v, D -> G D G^T, and Phi -> G Phi J^T as the rest pose turns by J.
+
+    Args:
+        features: Stacked, [R,N,H*34].
+        velocities: [R,C,(H-1)*3].
+        turn: G, [R,3,3].
+        joint: J, [R,3,3].
+    """
+    both = torch.eye(FEATURES).to(turn).repeat(len(turn), 1, 1)
+    for name, right in (("deformation_gradient", joint), ("body_deformation", turn)):
+        both[:, LAYOUT[name], LAYOUT[name]] = torch.einsum("bij,bkl->bikjl", turn, right).reshape(-1, 9, 9)
+    for name in _VECTORS:
+        both[:, LAYOUT[name], LAYOUT[name]] = turn
+    rows = features.unflatten(-1, (-1, FEATURES))
+    seen = (rows.flatten(1, 2) @ both.mT).reshape(features.shape)
+    return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
+
+
+class UnrolledBuilder(SampleBuilder):
+    """Builds batches for unrolled training; takes the place of `SampleBuilder` in a loader.
+
+    Args:
+        sequences: Training sequences.
+        network: In training; only its settings are read here.
+        noise: Perturbation of histories.
+        augmentation: Mirror and turns.
+        steps: K.
+        collision_passes: Of the scenes.
+    """
+
+    def __init__(
+        self,
+        sequences: list[SequenceData],
+        network: ManifoldAwareTransformer,
+        noise: NoiseConfig,
+        augmentation: Augmentation,
+        steps: int,
+        collision_passes: int,
+    ) -> None:
+        super().__init__(sequences, network.config, noise, augmentation)
+        self.module, self.steps, self.collision_passes = network, steps, collision_passes
+
+    def reaches(self, sequence: int, newest: int) -> bool:
+        """Whether all K frames after a frame are recorded."""
+        return newest + self.steps < len(self.sequences[sequence].vertices)
+
+    @torch.no_grad()
+    def build(
+        self,
+        picks: list[tuple[int, int]],
+        faces: int | None,
+        rng: np.random.Generator,
+        displacements: list[np.ndarray | None] | None = None,
+        part: slice = slice(None),
+    ) -> UnrolledBatch:
+        """Builds one batch, or a part of it; as `SampleBuilder.build`, but that all faces are there, and the network
+        sees them in subsets of about `faces` (None: all at once)."""
+        streams = rng.spawn(len(picks))[part]
+        total = sum(self.sequences[s].components for s, _ in picks) / len(picks)
+        picks = picks[part]
+        displacements = displacements[part] if displacements else [None] * len(picks)
+        history, device = self.network.history, self.device
+        mine = [self.sequences[s] for s, _ in picks]
+        face_splits = 1 if faces is None else max(round(min(len(data.faces) for data in mine) / faces), 1)
+
+        past, rows, bodies = [], [], []
+        for (_, t), data, stream, override in zip(picks, mine, streams, displacements, strict=True):
+            frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
+            delta, early = self.displacement(data, stream, override), max(history - 1 - t, 0)
+            moved = data.vertices[frames]
+            if delta is not None:  # frames before the first repeat it, displaced as it is
+                moved = moved + torch.from_numpy(delta[np.maximum(np.arange(history), early)]).to(device)
+            seen = data.interaction[frames].clone()  # [H,F,16]
+            seen[:early, :, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
+            seen[:early, :, COLUMNS["velocity"]] = 0.0
+            past.append(moved)
+            rows.append(seen)
+            bodies.append(data.body_frames([int(frames[0]), *range(t, t + self.steps + 1)]))
+        recorded = [
+            torch.cat([data.vertices[t + k] for (_, t), data in zip(picks, mine, strict=True)])
+            for k in range(1, self.steps + 1)
+        ]
+        placed = [
+            torch.from_numpy(np.concatenate(parts)).to(device) for parts in zip(*(v for v, _ in bodies), strict=True)
+        ]
+        scene = Scene(
+            [data.garment for data in mine],
+            PackedBodies.pack([f for _, f in bodies], [v.shape[1] for v, _ in bodies], range(len(picks)), device),
+            placed[0],
+            torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)]),
+            self.module,
+            face_splits=face_splits,
+            epsilon=None,
+            collision_passes=self.collision_passes,
+            half=False,
+            timings=Timings(device),
+        )
+        positions, interactions = torch.cat(past, dim=1), torch.cat(rows, dim=1)  # [H,V,3], [H,F,16]
+        features = torch.stack([_features(scene, v, r) for v, r in zip(positions, interactions, strict=True)], dim=1)
+        means = torch.stack([scene.components_mean(v) for v in positions], dim=1)  # [C,H,3]
+        turn, joint, mirrored = self._symmetries(streams)
+        return UnrolledBatch(
+            scene=scene,
+            vertices=positions[-1].contiguous(),
+            history=History(features[:, :-1], means.diff(dim=1)),
+            features=features[:, -1].contiguous(),
+            bodies=placed[1:],
+            recorded=recorded,
+            turn=turn,
+            joint=joint,
+            mirrored=mirrored,
+            face_weight=_means(scene.packed.garment_of_face, len(picks)),
+            vertex_weight=_means(scene.packed.garment_of_vertex, len(picks)),
+            components=torch.full((), total * len(picks), device=device),
+            ids=[(data.name, t) for (_, t), data in zip(picks, mine, strict=True)],
+        )
+
+    def _symmetries(self, streams: list[np.random.Generator]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Per sample: turn of what the network sees [B,3,3], the part that the rest pose shares, whether mirrored."""
+        settings = self.augmentation
+        free = settings.world_yaw and self.network.heading == "world"
+        angles, mirrored = np.zeros((2, len(streams)), np.float32), np.zeros(len(streams), bool)
+        for b, rng in enumerate(streams):
+            angles[1, b] = rng.standard_normal() * np.radians(settings.yaw)
+            angles[0, b] = rng.uniform(-np.pi, np.pi) if free else 0.0
+            mirrored[b] = rng.random() < settings.mirror
+        world, joint = rotation_about_up(torch.from_numpy(angles).to(self.device))
+        return joint @ world, joint, torch.from_numpy(mirrored).to(self.device)
+
+
+def _features(scene: Scene, vertices: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+    """Features of a frame [F,34] from positions and cached interactions [F,16]."""
+    packed, vertices = scene.packed, vertices.contiguous()
+    mean = segment_mean(face_centroids(vertices, packed.faces), packed.garment_of_face, packed.count)
+    return face_features(scene.inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, unpack(rows))
+
+
+def _means(owner: torch.Tensor, count: int) -> torch.Tensor:
+    """Weights whose sum with values is the mean over garments of means over what each owns."""
+    number = torch.bincount(owner.long(), minlength=count)
+    return (1.0 / (count * number))[owner.long()].float()

@@ -1,0 +1,124 @@
+"""The settings of a training run."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.training.samples.augmentation import Augmentation
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.pushforward import PushforwardConfig
+
+from .losses import LossConfig
+from .unrolled_objective import UnrollConfig
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Settings of a training run.
+
+    Attributes:
+        data: Folder of sequences.
+        out: Folder for everything that is written.
+        network: Shape to start from; "fast" is a network of patches, see patch_network.py.
+        overrides: Changes to it, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
+        init: Checkpoint to start from instead of random weights (its shape and statistics are kept): a file, a folder,
+            or the name of a network that ships. A network of patches may start from one of faces: see
+            `PatchTransformer.from_faces`.
+        grow: First grow `init` to the shape of `network` and `overrides`, without a change of what it predicts.
+        steps: Number of steps; None: as many as `time_limit` allows.
+        time_limit: Minutes after which the run stops cleanly, everything counted; None: no limit.
+        batch_size: Samples per step, of all processes together; they share them evenly.
+        splits: Subsets each garment's faces are split into at first (n_s); one of them makes a sample.
+        split_share: Share of the schedule after which garments are no longer split.
+        lr: Peak learning rate.
+        warmup: Share of the schedule that it rises over; after that it falls as a cosine to `lr_end` times the peak.
+        lr_end: See `warmup`.
+        weight_decay: Of AdamW; 0 is Adam.
+        clip: Largest norm of the gradient.
+        average: Decay of the weight average.
+        precision: "bfloat16" runs the transformer in mixed precision; weights, statistics and losses stay float32.
+        compile: Compile the network with torch.compile (needs Triton on a GPU, a C++ compiler on a CPU).
+        validate_every: Steps between validation rollouts.
+        validate_frames: Their length, from a cold start.
+        validate_sequences: Their number.
+        save_every: Steps between saved states.
+        log_every: Steps that a line of `log.jsonl` is the mean of; on a GPU, losses are read and checked as often.
+        statistics_batches: Batches that statistics are taken from.
+        max_sequences: Train on this many sequences only.
+        seed: Of everything random.
+        threads: CPU threads of torch; None leaves torch's own choice.
+        ahead: Batches built ahead in a thread; 0: none, in line.
+        cache: Folder for body interactions; None: beside the data.
+        device: "cpu", "cuda"; None: a GPU where there is one.
+        resume: Go on from the state in `out`, if there is one.
+    """
+
+    data: Path
+    out: Path
+    network: Literal["small", "base", "fast"] = "small"
+    overrides: tuple[str, ...] = ("dropout=0.0",)
+    init: Path | None = None
+    grow: bool = False
+    steps: int | None = None
+    time_limit: float | None = None
+    batch_size: int = 16
+    splits: int = 4
+    split_share: float = 0.9
+    lr: float = 1e-3
+    warmup: float = 0.02
+    lr_end: float = 0.01
+    weight_decay: float = 0.0
+    clip: float = 1.0
+    average: float = 0.998
+    precision: Literal["float32", "bfloat16"] = "float32"
+    compile: bool = False
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    pushforward: PushforwardConfig = field(default_factory=PushforwardConfig)
+    unroll: UnrollConfig = field(default_factory=UnrollConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    validate_every: int = 500
+    validate_frames: int = 60
+    validate_sequences: int = 3
+    save_every: int = 500
+    log_every: int = 20
+    statistics_batches: int = 24
+    max_sequences: int | None = None
+    seed: int = 0
+    threads: int | None = None
+    ahead: int = 3
+    cache: Path | None = None
+    device: str | None = None
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        if self.steps is None and self.time_limit is None:
+            raise ValueError("give steps or time_limit (minutes), so that the schedule knows its end")
+        if self.grow and self.init is None:
+            raise ValueError("grow needs init, the network to grow")
+        for name in ("batch_size", "splits", "validate_every", "save_every", "log_every", "statistics_batches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+        if self.unroll.steps > 1 and self.compile:
+            raise ValueError("unrolled training is not compiled: leave out compile, or set unroll.steps to 1")
+        if self.unroll.steps > 1 and self.augmentation.scale:
+            raise ValueError("unrolled samples keep their size: set augmentation.scale to 0, or unroll.steps to 1")
+
+    def network_config(self) -> NetworkConfig:
+        """The network's shape with the overrides applied."""
+        kinds = {f.name: type(f.default) for f in dataclasses.fields(NetworkConfig)}
+        changes = {}
+        for text in self.overrides:
+            name, _, value = text.partition("=")
+            if name not in kinds:
+                raise ValueError(f"no network setting {name!r}; there are {', '.join(kinds)}")
+            kind = kinds[name]
+            if kind is bool and value.lower() not in ("true", "false"):
+                raise ValueError(f"{name} must be true or false, got {value!r}")
+            changes[name] = value.lower() == "true" if kind is bool else kind(value)
+        return getattr(NetworkConfig, self.network)(**changes)

@@ -1,0 +1,117 @@
+"""The training loop.
+
+    warpgarment train --data sequences --out out/run --time-limit 60              # one CPU core, an hour
+    warpgarment train --data sequences --out out/run --time-limit 60 --resume     # goes on where it stopped
+    warpgarment train --data sequences --out out/run --steps 200000 --network base \\
+        --precision bfloat16 --compile                                            # one GPU, so many steps
+    warpgarment train --data sequences --out out/base --network base --init small --grow ...  # starts as good as small
+    torchrun --standalone --nproc-per-node 8 -m warpgarment train ...             # eight GPUs; same batches, shared
+
+Writes into the out folder: `network.safetensors` (averaged weights, ships), `best.safetensors` (the same at the best
+validation rollout), `state.safetensors` (everything needed to resume), `log.jsonl`, `config.json`, and TensorBoard
+events where installed. The schedule is a function of the step where `steps` is given, and of the time where only
+`time_limit` is. With `steps`, a run on one CPU that was stopped, or killed, and resumed gives the losses of an
+uninterrupted one, bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import torch
+
+from warpgarment.io.atomic import atomic_file
+from warpgarment.nn import checkpoint
+from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
+from warpgarment.nn.patches.network import PatchTransformer
+from warpgarment.training.distributed import Group, GroupError
+from warpgarment.training.grow import grow
+from warpgarment.training.samples.loader import Plan
+from warpgarment.training.samples.single_step import SampleBuilder
+
+from .config import TrainConfig
+from .log import say
+from .objective import CompileFailed
+from .rate import spelt
+from .run import STATE, NonFiniteLoss, Run
+from .training_set import NoTrainingData, load_sequences, load_validation, report
+
+__all__ = ["CompileFailed", "GroupError", "NoTrainingData", "NonFiniteLoss", "Run", "TrainConfig", "train"]
+
+
+def train(config: TrainConfig) -> Path:
+    """Trains a network, together with the other processes where torchrun started several.
+
+    Returns:
+        The file of the network that did best in the validation rollouts, or the final one where there were none.
+
+    Raises:
+        NoTrainingData: Nothing in the data folder is usable.
+        NonFiniteLoss: Training diverged.
+        GrowthError: `init` cannot be grown to the shape wanted.
+        CompileFailed: `compile` was asked for, and there is no compiler.
+        CheckpointError: The state to resume from does not fit.
+        GroupError: The processes cannot work together.
+    """
+    began = time.monotonic()
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    with Group(config.device) as group:
+        return _train(config, group, began)
+
+
+def _train(config: TrainConfig, group: Group, began: float) -> Path:
+    group.part(config.batch_size)
+    torch.manual_seed(config.seed)
+    if config.init is not None:
+        network = checkpoint.load(checkpoint.find(config.init), device=group.device)
+        wanted = config.network_config()
+        if config.grow:
+            network = grow(network, wanted)
+        elif isinstance(network, ManifoldAwareTransformer) and wanted.architecture == "patches":
+            network = PatchTransformer.from_faces(network, wanted).to(group.device)
+    else:
+        network = build_network(config.network_config()).to(group.device)
+    skipped: dict[str, str] = {}
+    try:
+        sequences = load_sequences(config, network.config, skipped, group)
+        validation = load_validation(config, skipped) if group.first else []
+        builder = SampleBuilder(sequences, network.config, config.noise, config.augmentation)
+        sizes, counts = [len(s.faces) for s in sequences], [s.count - config.unroll.steps + 1 for s in sequences]
+        plan = Plan(sizes, counts, config.batch_size, config.seed)
+        run = Run(config, network, plan, builder, validation, began, group)
+        if group.first:
+            _prepare(config)
+            say(
+                f"{len(sequences)} sequences, {sum(counts):,} samples, {plan.batches} batches an epoch, {len(skipped)} "
+                f"skipped; {network.parameter_count():,} parameters on "
+                + (f"{group.size} devices like " if group.size > 1 else "")
+                + str(group.device)
+            )
+        run.start(Path(config.out) / STATE)
+        try:
+            run.loop()
+        except KeyboardInterrupt:
+            if group.size == 1:  # others may be elsewhere; what was saved last counts
+                run.save()
+            raise
+        best = run.finish()
+    finally:
+        if skipped and group.first:
+            say(report(skipped))
+    if group.first:
+        say(f"step {run.step:,}: {best}" + (f", {spelt(run.figures)}" if run.figures else ""))
+    return best
+
+
+def _prepare(config: TrainConfig) -> None:
+    """The out folder, without what a run that was killed left half written."""
+    out = Path(config.out)
+    out.mkdir(parents=True, exist_ok=True)
+    for path in out.glob(".*.partial*"):
+        path.unlink()
+    with atomic_file(out / "config.json") as temporary:
+        temporary.write_text(json.dumps(dataclasses.asdict(config), default=str, indent=2), "utf-8")

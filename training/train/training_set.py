@@ -1,0 +1,124 @@
+"""The sequences of a run. What cannot be used is skipped, and its reason kept: bad data never ends a run."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from warpgarment.errors import MeshError
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.objects.body import BodyMotion
+from warpgarment.training.data.sequence import Sequence, list_sequences, read_manifest
+from warpgarment.training.distributed import Group
+from warpgarment.training.samples.interactions import cached, default_cache
+from warpgarment.training.samples.recorded import SequenceData
+
+from .config import TrainConfig
+
+SAME_DATA = "All machines must see the same data folder; compare it with `warpgarment dataset verify`."
+
+
+class NoTrainingData(ValueError):
+    """No sequence can be trained on; the message counts the reasons."""
+
+
+def load_sequences(
+    config: TrainConfig, network: NetworkConfig, skipped: dict[str, str], group: Group
+) -> list[SequenceData]:
+    """Training sequences with their cached interactions; what cannot be used goes to `skipped` with its reason.
+
+    Raises:
+        NoTrainingData: None can be used.
+        GroupError: Processes see different ones.
+    """
+    cache = Path(config.cache) if config.cache else default_cache(Path(config.data))
+    folders = folders_of(Path(config.data), "train", skipped)[: config.max_sequences]
+    if group.size > 1:  # each fills its share of the cache, then all read it
+        for folder in _watched(folders[group.rank :: group.size], group):
+            try:
+                cached(Sequence.load(folder), folder, cache, group.device)
+            except Exception as error:
+                reason_of(error)
+        group.wait()
+    sequences = []
+    for folder in _watched(folders, group):
+        try:
+            sequences.append(SequenceData(Sequence.load(folder), folder, cache, network, group.device))
+        except Exception as error:
+            skipped[folder.name] = reason_of(error)
+    names = "\n".join(f"{s.name} {len(s.faces)} {s.count}" for s in sequences)
+    group.agree("the checksum of the usable sequences", zlib.crc32(names.encode()), SAME_DATA)
+    if not sequences:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
+        found = f"{len(folders)} training sequences, none usable" if folders else "no training sequences"
+        raise NoTrainingData(f"{config.data}: {found}{f' ({reasons})' if reasons else ''}")
+    return sequences
+
+
+def load_validation(config: TrainConfig, skipped: dict[str, str]) -> list[tuple[Sequence, BodyMotion, int]]:
+    """A few validation sequences, spread over the list, with their bodies: (sequence, body, frames to predict)."""
+    folders = folders_of(Path(config.data), "validation", skipped)
+    wanted = min(config.validate_sequences, len(folders))
+    chosen = [folders[(i * len(folders)) // wanted] for i in range(wanted)]
+    found = []
+    for folder in chosen:
+        try:
+            sequence = Sequence.load(folder)
+            body = sequence.body()
+            frames = min(len(sequence.vertices), body.frames, config.validate_frames + 1)
+            if frames < 2 or not np.isfinite(np.asarray(sequence.vertices[:frames])).all():
+                raise ValueError("too short, or not finite")
+            found.append((sequence, body, frames - 1))
+        except Exception as error:
+            skipped[folder.name] = reason_of(error)
+    return found
+
+
+def folders_of(root: Path, split: str | None, skipped: dict[str, str]) -> list[Path]:
+    """Good sequences of a split (None: of all), as `list_sequences` gives them, but that a manifest which is missing or
+    cannot be read only costs its own sequence, and goes to `skipped` with the reason.
+
+    Raises:
+        FileNotFoundError: There is no such folder.
+    """
+    if not root.is_dir():
+        return list_sequences(root)  # says what to do
+    found = []
+    for folder in sorted(path for path in root.glob("[!.]*") if path.is_dir()):
+        try:
+            manifest = read_manifest(folder)
+        except MeshError as error:
+            if any(folder.glob("*.npy")):  # else it is no sequence
+                skipped[folder.name] = str(error)
+            continue
+        if split in (None, manifest.get("split")) and manifest.get("status") == "good":
+            found.append(folder)
+    return found
+
+
+def report(skipped: dict[str, str]) -> str:
+    """How many were skipped, and why, a line each; empty where none was."""
+    if not skipped:
+        return ""
+    lines = [f"  {name}: {reason}" for name, reason in sorted(skipped.items())]
+    return "\n".join([f"{len(skipped)} sequence{'s' if len(skipped) > 1 else ''} skipped:", *lines])
+
+
+def reason_of(error: Exception) -> str:
+    """The reason for a skip, as text.
+
+    Raises:
+        MemoryError, torch.OutOfMemoryError: The error itself, where it is not the data's fault.
+    """
+    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+        raise error
+    return f"{type(error).__name__}: {error}"
+
+
+def _watched(folders: list[Path], group: Group) -> Iterable[Path]:
+    return tqdm(folders, desc="sequences", unit="", leave=False, disable=not group.first)

@@ -1,0 +1,199 @@
+r"""Training on several steps in a row: the network's own prediction becomes its next input, and gradients flow through.
+
+    predict -> compose -> singular values -> Poisson -> collisions -> features of the next frame -> predict -> ...
+
+with the methods of `warpgarment.sim.scene.Scene`, which the simulator runs. Every step k = 1..K has the loss of
+one-step training, in the same normalised quantities, against the answer that leads from the predicted state to the
+recording:
+
+    Psi_k = Phi_{t+k} Phi~_{t+k-1}^-1      Sigma_k = Sigma_{t+k}      q_k = z_{t+k} - z~_{t+k-1}      (~ predicted)
+
+and, with a weight of its own, the distance of the predicted vertices from the recorded ones in metres:
+
+    L = 1/K sum_k [ L_def + lambda_sv L_sv + lambda_vel L_vel + position |V~_{t+k} - V_{t+k}| ]
+
+What is differentiated: weights at every step; the state through deformation gradients, normals, centroids, distances
+and directions to the body, singular values, velocities, the heading; singular value replacement; the Poisson solve in
+Phi and mean; collision refinement for fixed contacts; and what of the targets depends on the state. Constant are: which
+body face is nearest, its nearest point, deformation and velocity, which are found anew at every step without gradient
+(for the distance that is exact; the direction is taken to turn about a fixed point); the rotation of the residual; the
+body with what is pinned to it; recorded frames.
+
+The Poisson solve needs whole garments. The schedule's splits become the simulator's `face_splits`: all faces are seen,
+in interleaved subsets. A sample counts the same however many faces it has, so that a mean over equal parts of a batch
+is the loss of the whole. Gaussian noise on features, mirror, yaw, displaced histories and the pool work as in one-step
+training; a change of size does not. Batches are built in line, `ahead` or not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
+from warpgarment.kernels.deformation.svd import singular_values
+from warpgarment.kernels.features.face import LAYOUT
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.heading import canonical_frame
+from warpgarment.nn.network import rotate_output
+from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
+from warpgarment.objects.pack import PaddedView
+from warpgarment.training.samples.augmentation import mirror
+from warpgarment.training.samples.unrolled import UnrolledBatch, turned
+
+from .losses import LossConfig, weighted
+
+MOST_STEPS = 8
+
+
+@dataclass(frozen=True)
+class UnrollConfig:
+    """Settings of unrolled training.
+
+    Attributes:
+        steps: Steps K in a row; 1 is one-step training, and nothing else here matters.
+        position: Weight of the position loss [1/m]; 0: none. At 2000 it is most of the loss: what rollouts are judged
+            by, where the other terms ask for every wrinkle.
+        collision_passes: Collision refinements between steps, at most; 0: none. A rollout has up to four.
+    """
+
+    steps: int = 1
+    position: float = 2000.0
+    collision_passes: int = 1
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps <= MOST_STEPS:
+            raise ValueError(f"unroll.steps must lie between 1 and {MOST_STEPS}, got {self.steps}")
+        if self.position < 0.0 or self.collision_passes < 0:
+            raise ValueError(
+                "unroll.position and unroll.collision_passes must not be negative, got "
+                f"{self.position} and {self.collision_passes}"
+            )
+
+
+class UnrolledObjective(nn.Module):
+    """Loss of a batch of unrolled samples.
+
+    Args:
+        network: In training.
+        config: Weights and units of the loss.
+        noise: Standard deviation of Gaussian noise on the normalised inputs; 0: none.
+        precision: "float32" or "bfloat16", of the transformer.
+        unroll: Steps and position loss.
+    """
+
+    figures = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity", "position_m")
+
+    def __init__(
+        self, network: ManifoldAwareTransformer, config: LossConfig, noise: float, precision: str, unroll: UnrollConfig
+    ) -> None:
+        super().__init__()
+        self.network, self.config, self.noise, self.unroll = network, config, noise, unroll
+        self.half = precision == "bfloat16"
+
+    @staticmethod
+    def inputs(batch: UnrolledBatch) -> tuple[UnrolledBatch]:
+        """What `forward` takes."""
+        return (batch,)
+
+    def forward(self, batch: UnrolledBatch) -> torch.Tensor:
+        """Losses [5]: total, its three normalised terms, all means over the steps, and the mean distance of predicted
+        from recorded vertices [m] over the steps that were solved (the last one is where it has a weight)."""
+        found, distances = [], []
+        for terms, vertices, recorded in self.steps(batch):
+            found.append(terms)
+            if vertices is not None:
+                distances.append(((vertices - recorded).norm(dim=1) * batch.vertex_weight).sum())
+        terms = torch.stack(found).mean(dim=0)
+        position = torch.stack(distances).mean() if distances else terms.new_zeros(())
+        total = terms[0] + self.unroll.position * position if self.unroll.position else terms[0]
+        return torch.stack([total, *terms[1:], position if self.unroll.position else position.detach()])
+
+    def steps(self, batch: UnrolledBatch):
+        """Yields for each step: the losses [4] of `losses.Losses`, predicted vertices [V,3] (None where nothing needs
+        the last ones) and recorded ones."""
+        scene, config = batch.scene, self.network.config
+        vertices, history, features = batch.vertices, batch.history, batch.features
+        for k, recorded in enumerate(batch.recorded):
+            stacked = history.stacked(features)
+            newest = context(stacked.flatten(1), scene.packed.face_component, scene.packed.component_count)
+            target = targets(self._wanted(batch, vertices, features, recorded), newest, residual=config.residual)
+            output, terms = self._network(batch, stacked.flatten(1), history.velocities.flatten(1), target)
+            last = k + 1 == len(batch.recorded)
+            if last and not self.unroll.position:
+                yield terms, None, recorded
+                return
+            body = batch.bodies[k + 1]
+            solved, finite = scene.reconstruct(
+                vertices, compose(output, newest, residual=config.residual), features, body
+            )
+            if self.unroll.collision_passes:
+                solved = scene.push_out(solved, body, finite, scene.carried(vertices, features))[0]
+            yield terms, solved, recorded
+            if not last:
+                velocity = scene.components_mean(solved) - scene.components_mean(vertices)
+                history = history.followed(stacked, velocity)
+                vertices = solved
+                features = scene.features(vertices, body, batch.bodies[k + 2])
+
+    @staticmethod
+    def _wanted(batch: UnrolledBatch, vertices: torch.Tensor, features: torch.Tensor, recorded: torch.Tensor) -> Step:
+        """The step from the state to the recorded frame."""
+        scene = batch.scene
+        phi = features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3).contiguous()
+        phi_next = deformation_gradient_from_inverse(scene.inverse_rest, recorded, scene.packed.faces)
+        velocity = scene.components_mean(recorded) - scene.components_mean(vertices)
+        return Step(relative_deformation_gradient(phi_next, phi), singular_values(phi_next), velocity)
+
+    def _network(
+        self, batch: UnrolledBatch, stacked: torch.Tensor, velocities: torch.Tensor, target: NetworkOutput
+    ) -> tuple[NetworkOutput, torch.Tensor]:
+        """Output of the network for packed inputs [F,H*34] and [C,(H-1)*3], and its losses [4] against a target."""
+        output = NetworkOutput(*(torch.zeros_like(part) for part in target))
+        terms = stacked.new_zeros(4)
+        for view in batch.scene.views:
+            rows, losses = self._view(batch, view, stacked, velocities, target)
+            view.add_to(output, rows)
+            terms = terms + losses
+        return output, terms
+
+    def _view(
+        self,
+        batch: UnrolledBatch,
+        view: PaddedView,
+        stacked: torch.Tensor,
+        velocities: torch.Tensor,
+        target: NetworkOutput,
+    ) -> tuple[NetworkOutput, torch.Tensor]:
+        """The same for the rows of a view: output in world space, and their share of the losses."""
+        network, garment = self.network, batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
+        x, v = view.faces(stacked), view.components(velocities)
+        wanted = NetworkOutput(
+            view.faces(target.psi), view.faces(target.singular_values), view.components(target.velocity)
+        )
+        turn = batch.turn[garment]
+        if network.config.heading == "canonical":
+            turn = turn @ canonical_frame(x, view.face_mask)
+        x, v = turned(x, v, turn, batch.joint[garment])
+        wanted, mirrored = rotate_output(wanted, turn), batch.mirrored[garment]
+        x, v, wanted = mirror(x, v, wanted, mirrored)
+        inputs = network.encode(x, v)
+        if self.noise:
+            inputs = tuple(part + self.noise * torch.randn_like(part) for part in inputs)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.half):
+            predicted = network.forward_normalised(
+                *inputs, view.weights, face_mask=view.face_mask, velocity_mask=view.component_mask
+            )
+        face_weight = view.faces(batch.face_weight)
+        face_weight = face_weight if view.face_mask is None else face_weight * view.face_mask
+        component_weight = (view.share[:, None] / batch.components).expand(v.shape[:2])
+        if view.component_mask is not None:
+            component_weight = component_weight * view.component_mask
+        losses = weighted(
+            predicted, network.normalise_targets(wanted), network, self.config, face_weight, component_weight
+        )
+        predicted = type(predicted)(*(part.float() for part in predicted))
+        said = mirror(x, v, network.denormalise(predicted), mirrored)[2]
+        return rotate_output(said, turn, inverse=True), torch.stack(losses)
