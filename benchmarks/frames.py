@@ -14,7 +14,7 @@ from benchmarks.batch import Rolling, scenes_of
 from benchmarks.measure import NO_GPU, Row, aimed
 from benchmarks.networks import Named
 from warpgarment.kernels.linear import conjugate_gradients
-from warpgarment.sim.frame import advance
+from warpgarment.sim.advance import advance
 from warpgarment.sim.graph import WARM_UP
 from warpgarment.sim.simulator import Simulator
 

@@ -19,8 +19,9 @@ from warpgarment.nn.attention import ManifoldAwareAttention, geodesic_weights
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.layout import dense_weights, pooled_weights
 from warpgarment.nn.patches.layout import PatchLayout
+from warpgarment.nn.rows import padded_views
 from warpgarment.objects.garment import KEPT, Garment
-from warpgarment.objects.pack import PackedGarments, padded_views
+from warpgarment.objects.pack import PackedGarments
 
 from . import exact
 

@@ -1,6 +1,6 @@
 """The network against the device: operations and bytes, and what the device does of either at best.
 
-Operations are those of `warpgarment.training.flops`, forward. Bytes are the fewest that the layers as written need when
+Operations are those of `warpgarment.nn.flops`, forward. Bytes are the fewest that the layers as written need when
 every operator reads its inputs and writes its outputs once: per token and layer, in units of the embedding E,
 
     norms 4, q, k, v 1 + 3 - 2 m, attention 4 - 2 m, output 2, residual sums 6, feed-forward 2 + 4 W/E
@@ -28,10 +28,10 @@ from benchmarks.networks import Named
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
 from warpgarment.kernels.features.face import FEATURES
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.flops import forward_flops
 from warpgarment.nn.patches.layout import SHARES, PatchLayout
 from warpgarment.objects.garment import POOLED
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.flops import forward_flops
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 MATRIX = {"cpu": 1536, "cuda": 8192}

@@ -58,11 +58,13 @@ def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
 
 
 def as_argument(tensor: torch.Tensor, dtype: type) -> object:
-    """What `as_warp` says, for the arguments of a launch alone, at a tenth of the cost: a descriptor.
+    """A tensor as an argument of a launch: a descriptor, which costs a tenth of an array.
 
     It keeps no memory alive, so the tensor must outlive the launch; a copy that had to be made is kept by its array.
     """
-    if tensor.numel() == 0 or not tensor.is_contiguous():
+    if tensor.numel() == 0:
+        tensor = tensor.new_empty(tensor.shape)  # slices of nothing have strides that Warp refuses
+    elif not tensor.is_contiguous():
         return as_warp(tensor, dtype)
     return descriptor(tensor, dtype)
 

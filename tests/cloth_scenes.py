@@ -6,7 +6,7 @@ import meshes
 import numpy as np
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 from warpgarment.training.teachers import Cloth, ClothScene
 from warpgarment.training.teachers.checks import flat_sheet, hanging_sheet
 

@@ -11,7 +11,7 @@ from warpgarment.errors import MeshError
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.objects.body import BodyMotion
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.baselines import skinned
+from warpgarment.training.rollouts import skinned
 from warpgarment.view.report import table
 
 

@@ -42,8 +42,8 @@ def test_one_address_under_several_shapes():
 
 def test_memory_is_given_back_and_few_are_remembered(monkeypatch):
     """Descriptors would keep every tensor that was ever passed, or pile up in a long training."""
-    monkeypatch.setattr(_torch, "MOST_DESCRIPTORS", 8)
-    monkeypatch.setattr(_torch, "_descriptors", {})
+    monkeypatch.setattr(launch, "MOST_DESCRIPTORS", 8)
+    monkeypatch.setattr(launch, "_descriptors", {})
     tensor = torch.zeros(100)
     alive = weakref.ref(tensor.untyped_storage())
     as_argument(tensor, wp.float32)

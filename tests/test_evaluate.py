@@ -16,11 +16,11 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training.baselines import kabsch, rigid, skinned
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.evaluate import measure as evaluate
 from warpgarment.training.evaluate.measure import EvaluateConfig, NoTestData
-from warpgarment.training.tables.errors import OptionMissing
+from warpgarment.training.rollouts import kabsch, rigid, skinned
+from warpgarment.training.tables.options import OptionMissing
 
 
 def moving_body(frames: int, move) -> tuple[BodyMotion, Garment]:

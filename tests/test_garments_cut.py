@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 
 from warpgarment.objects.garment import Garment
 from warpgarment.training.garments.faults import faults
-from warpgarment.training.garments.make import CATEGORIES, Pattern, make_garment, needs_forearms, sampled_pattern
+from warpgarment.training.garments.make import make_garment
+from warpgarment.training.garments.pattern import CATEGORIES, Pattern, needs_forearms, sampled_pattern
 from warpgarment.training.meshes.cutting import (
     boundary_loops,
     cut_below_zero,

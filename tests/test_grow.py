@@ -9,8 +9,8 @@ from training_runs import config_for
 
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.grow import GrowthError, grow
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.training.grow import GrowthError, grow
 from warpgarment.training.samples.pushforward import PushforwardConfig
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.start import train

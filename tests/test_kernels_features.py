@@ -11,7 +11,7 @@ from reference import signed_distance as reference_distance
 from reference.finite_differences import numeric_gradient
 
 from warpgarment.kernels import deformation, features, sdf
-from warpgarment.kernels.features.frame_features import frame_features
+from warpgarment.kernels.features.face import frame_features
 
 GARMENTS = meshes.garments()
 

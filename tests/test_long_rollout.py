@@ -18,9 +18,8 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.evaluate.measure import EvaluateConfig, evaluate
-from warpgarment.training.tables.errors import DataLacks, OptionMissing
 from warpgarment.training.tables.long_rollout import Limits, extended, figures, judged, there_and_back, walk
-from warpgarment.training.tables.options import TableOptions
+from warpgarment.training.tables.options import DataLacks, OptionMissing, TableOptions
 
 
 def test_times_turn_round_without_a_jump():

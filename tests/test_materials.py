@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from cloth_scenes import stretch
 
+from warpgarment.objects.material import Material
 from warpgarment.training.generate.quality import Limits
-from warpgarment.training.materials import DLAYERS, RANGES, Material, from_blender, sampled_material, to_blender
+from warpgarment.training.materials import DLAYERS, RANGES, from_blender, sampled_material, to_blender
 from warpgarment.training.teachers import Cloth, ClothScene
 from warpgarment.training.teachers.checks import hanging_sheet
 from warpgarment.training.teachers.newton.teacher import NewtonTeacher

@@ -15,7 +15,8 @@ from warpgarment.training.bodies import other as other_bodies
 from warpgarment.training.bodies import skeleton
 from warpgarment.training.bodies.anny import PHENOTYPES, RestBody, bundled_body, sampled_phenotype
 from warpgarment.training.bodies.limb_clearance import resolve_clearance
-from warpgarment.training.garments.make import Pattern, make_garment
+from warpgarment.training.garments.make import make_garment
+from warpgarment.training.garments.pattern import Pattern
 from warpgarment.training.motions.procedural import procedural
 
 

@@ -11,7 +11,6 @@ from data_bodies import rest_body
 
 from warpgarment.objects.garment import Garment
 from warpgarment.training.garments import outfits
-from warpgarment.training.garments.make import CATEGORIES
 from warpgarment.training.garments.outfits import (
     OutfitError,
     OutfitPattern,
@@ -20,6 +19,7 @@ from warpgarment.training.garments.outfits import (
     outfit_of,
     sampled_outfit,
 )
+from warpgarment.training.garments.pattern import CATEGORIES
 
 BETWEEN = 0.012
 FLAT = Garment([[0, 0, 0], [0, 0, 1], [1, 0, 0]], [[0, 1, 2]])

@@ -21,11 +21,11 @@ from warpgarment.nn import checkpoint
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
+from warpgarment.nn.flops import forward_flops
 from warpgarment.nn.network import STATISTICS, rotate_output
 from warpgarment.nn.patches.layout import PatchLayout, garment_patches, patch_layout
 from warpgarment.nn.patches.network import PatchTransformer
 from warpgarment.objects.garment import Garment
-from warpgarment.training.flops import forward_flops
 
 TINY = {
     "embedding": 24,

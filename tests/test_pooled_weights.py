@@ -12,8 +12,9 @@ from warpgarment.geometry.pooled_geodesics import NEAR, PooledGeodesics, _furthe
 from warpgarment.nn.attention import ManifoldAwareAttention, geodesic_weights
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.layout import Bags, bag_product, dense_weights, pooled_weights
+from warpgarment.nn.rows import padded_views
 from warpgarment.objects.garment import Garment
-from warpgarment.objects.pack import PackedGarments, padded_views
+from warpgarment.objects.pack import PackedGarments
 
 CPU = torch.device("cpu")
 

@@ -14,7 +14,7 @@ from reader_files import STRIP, TRIANGLES, moving
 from warpgarment.errors import MeshError
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 from warpgarment.training.readers import PickleRefused, detect, read_dlayers, read_recording
 from warpgarment.training.readers.blender_cloth import blender_material, mass_ratio, wind_speed
 from warpgarment.training.teachers import Cloth, ClothScene

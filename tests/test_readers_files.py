@@ -9,8 +9,8 @@ from reader_files import QUADS, STRIP, TRIANGLES, moving, write_obj, write_point
 from warpgarment.errors import MeshError
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
+from warpgarment.objects.material import Material
 from warpgarment.training.data.sequence import Sequence, list_sequences
-from warpgarment.training.materials import Material
 from warpgarment.training.readers import (
     RecordedGarment,
     Recording,

@@ -8,13 +8,8 @@ from dataclasses import replace
 import pytest
 from data_bodies import write_bvh
 
-from warpgarment.training.generate.recipes import (
-    ConfigurationError,
-    GenerateConfig,
-    plan_sequence,
-    split_of_clips,
-    split_of_number,
-)
+from warpgarment.training.data.splits import split_of_clips, split_of_number
+from warpgarment.training.generate.recipes import ConfigurationError, GenerateConfig, plan_sequence
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ import pytest
 from data_bodies import rest_body
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.garments.make import CATEGORIES, Pattern, make_garment
+from warpgarment.training.garments.make import make_garment
+from warpgarment.training.garments.pattern import CATEGORIES, Pattern
 from warpgarment.training.garments.seams import Seam, Seams, cut_seams, parted, sampled_seams
 from warpgarment.training.meshes.cutting import boundary_loops
 

@@ -17,9 +17,10 @@ from warpgarment.errors import MeshError
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.rows import padded_views
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.objects.pack import PackedGarments, padded_views
+from warpgarment.objects.pack import PackedGarments
 from warpgarment.objects.status import Verdict
 from warpgarment.sim.pins import BodyPins, barycentric_coordinates
 from warpgarment.sim.simulator import Simulator

@@ -22,8 +22,7 @@ from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence, list_sequences
 from warpgarment.training.evaluate.measure import EvaluateConfig, evaluate
 from warpgarment.training.tables import figure7, meshing, protocol, report
-from warpgarment.training.tables.errors import DataLacks, OptionMissing
-from warpgarment.training.tables.options import TableOptions
+from warpgarment.training.tables.options import DataLacks, OptionMissing, TableOptions
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from warpgarment.training.data.sequence import Sequence, list_sequences
 from warpgarment.training.evaluate.measure import evaluate
 from warpgarment.training.rollouts import predict
 from warpgarment.training.tables import compare, runs, settings, variants
-from warpgarment.training.tables.errors import OptionMissing
+from warpgarment.training.tables.options import OptionMissing
 from warpgarment.training.train import start as train
 from warpgarment.training.train.config import TrainConfig
 

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.io.pc2 import read_pc2
 from warpgarment.objects.garment import Garment
-from warpgarment.training.materials import Material, to_blender
+from warpgarment.objects.material import Material
+from warpgarment.training.materials import to_blender
 from warpgarment.training.teachers import Cloth, ClothScene, TeacherError, make_teacher
 from warpgarment.training.teachers.blender import environment
 from warpgarment.training.teachers.blender.teacher import BlenderTeacher, write_scene

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import j0, jn_zeros
 
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 from warpgarment.training.teachers import ClothScene
 from warpgarment.training.teachers.checks import (
     CheckResult,
@@ -20,7 +20,8 @@ from warpgarment.training.teachers.checks import (
     run_checks,
     vertex_areas,
 )
-from warpgarment.training.teachers.newton.teacher import CONVERGED, NewtonTeacher
+from warpgarment.training.teachers.newton.settings import CONVERGED
+from warpgarment.training.teachers.newton.teacher import NewtonTeacher
 
 
 class Known:

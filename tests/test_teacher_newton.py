@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.objects.garment import Garment
 from warpgarment.training.teachers import ClothScene, TeacherError, make_teacher
-from warpgarment.training.teachers.newton.teacher import NewtonSettings, NewtonTeacher
+from warpgarment.training.teachers.newton.settings import NewtonSettings
+from warpgarment.training.teachers.newton.teacher import NewtonTeacher
 from warpgarment.training.teachers.newton.worlds import Worlds
 from warpgarment.training.teachers.scenes import MovingFrame
 

@@ -10,7 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from warpgarment.kernels.features.face import FEATURES
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.training.flops import forward_flops, peak_of, step_flops
+from warpgarment.nn.flops import forward_flops, peak_of, step_flops
 from warpgarment.training.train.rate import Rate, spelt
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 import tyro
 
-from warpgarment.cli import UsageError
+from warpgarment.errors import UsageError
 from warpgarment.io.atomic import atomic_file
 
 

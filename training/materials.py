@@ -37,51 +37,10 @@ and checked against it:
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
 
 import numpy as np
 
-
-@dataclass(frozen=True)
-class Material:
-    """One cloth, in SI units.
-
-    Attributes:
-        density: Mass per area [kg/m^2].
-        stretch: Resistance to change of area: first Lame parameter of the sheet [N/m].
-        shear: Resistance to shear, and with it to stretch: second Lame parameter of the sheet [N/m].
-        bend: Moment per angle of a bent edge and its length [N].
-        damping: Share of the membrane's shear stiffness that damps its rate of change [s].
-        friction: Coulomb coefficient against the body and other cloth.
-    """
-
-    density: float = 0.2
-    stretch: float = 1e3
-    shear: float = 1e3
-    bend: float = 1e-3
-    damping: float = 1e-5
-    friction: float = 0.2
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            least = 0.0 if name in ("bend", "damping", "friction") else 1e-9
-            if not (math.isfinite(value) and value >= least):
-                raise ValueError(f"a material's {name} must be {'positive' if least else 'at least 0'}, got {value}")
-
-    @property
-    def modulus(self) -> float:
-        """Young's modulus of the sheet [N/m]: tension per width over strain, 4 μ (λ + μ) / (λ + 2 μ)."""
-        return 4.0 * self.shear * (self.stretch + self.shear) / (self.stretch + 2.0 * self.shear)
-
-    @property
-    def poisson(self) -> float:
-        """Poisson's ratio of the sheet: how far it contracts across, as a share of how far it stretches."""
-        return self.stretch / (self.stretch + 2.0 * self.shear)
-
-    def as_dict(self) -> dict[str, float]:
-        """Plain values for a manifest."""
-        return asdict(self)
-
+from warpgarment.objects.material import Material
 
 DLAYERS = {
     "mass": (0.2, 0.8),

@@ -26,3 +26,7 @@ class MissingExtra(ImportError):
     def __init__(self, extra: str, purpose: str = "This"):
         self.extra = extra
         super().__init__(f'{purpose} needs an optional package: pip install "warpgarment[{extra}]"')
+
+
+class UsageError(ValueError):
+    """Options that parse but do not fit each other or the files they name."""

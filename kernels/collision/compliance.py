@@ -30,8 +30,8 @@ import numpy as np
 import scipy.sparse
 import torch
 
-from warpgarment.kernels.linear.conjugate_gradients import System
 from warpgarment.kernels.linear.factor import component_blocks
+from warpgarment.kernels.linear.system import System
 
 LARGEST = 2048
 """Vertices of the largest component that gets a compliance matrix (16 MB)."""

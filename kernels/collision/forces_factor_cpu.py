@@ -24,9 +24,9 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import torch_stream
-from warpgarment.kernels.linear.conjugate_gradients import System, view
+from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.linear.factor import Factor
+from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.linear.triangular import eliminate, padded, substitute_back, substitution
 from warpgarment.kernels.operator import allocate
 
@@ -206,22 +206,22 @@ def solve(
             contact_forces,
             dim=len(factor.base),
             inputs=[
-                view(system.start, wp.int32),
-                view(system.rows, wp.int32),
+                as_argument(system.start, wp.int32),
+                as_argument(system.rows, wp.int32),
                 *substitution(factor),
-                view(normal, wp.vec3d),
-                view(gap, wp.float64),
-                view(tolerance, wp.float64),
+                as_argument(normal, wp.vec3d),
+                as_argument(gap, wp.float64),
+                as_argument(tolerance, wp.float64),
                 float(relative),
                 int(max_iterations),
-                *(view(t, wp.int32) for t in integers),
-                view(vectors[0], wp.vec4d),
-                *(view(t, wp.float64) for t in scalars),
-                view(vectors[1], wp.vec4d),
-                view(force, wp.float64),
-                view(increment, wp.vec3d),
-                view(report, wp.int32),
-                view(error, wp.float64),
+                *(as_argument(t, wp.int32) for t in integers),
+                as_argument(vectors[0], wp.vec4d),
+                *(as_argument(t, wp.float64) for t in scalars),
+                as_argument(vectors[1], wp.vec4d),
+                as_argument(force, wp.float64),
+                as_argument(increment, wp.vec3d),
+                as_argument(report, wp.int32),
+                as_argument(error, wp.float64),
             ],
             device=warp_device,
         )

@@ -19,8 +19,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import torch_stream
-from warpgarment.kernels.linear.conjugate_gradients import System, view
+from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.operator import allocate
 
 from .compliance import Compliance
@@ -210,33 +210,33 @@ def solve(
     force = torch.zeros(vertices, dtype=torch.float64, device=device)
 
     def of_16(tensor: torch.Tensor) -> object:
-        return view(tensor.view(-1, 16), vec16)
+        return as_argument(tensor.view(-1, 16), vec16)
 
     with torch_stream(device) as warp_device:
         wp.launch(
             wide_contacts,
             dim=len(model.base),
             inputs=[
-                view(system.start, wp.int32),
-                view(system.rows, wp.int32),
-                view(model.base, wp.int64),
-                view(model.room, wp.int64),
-                view(model.wide, wp.int32),
-                view(model.values, wp.float32),
+                as_argument(system.start, wp.int32),
+                as_argument(system.rows, wp.int32),
+                as_argument(model.base, wp.int64),
+                as_argument(model.room, wp.int64),
+                as_argument(model.wide, wp.int32),
+                as_argument(model.values, wp.float32),
                 of_16(model.values),
-                view(normal, wp.vec3d),
-                view(gap, wp.float64),
-                view(tolerance, wp.float64),
+                as_argument(normal, wp.vec3d),
+                as_argument(gap, wp.float64),
+                as_argument(tolerance, wp.float64),
                 float(relative),
                 int(max_iterations),
                 of_16(coupling),
-                view(place, wp.int32),
+                as_argument(place, wp.int32),
                 *(of_16(vector) for vector in wide),
-                *(view(vector, wp.float64) for vector in scalars),
-                view(force, wp.float64),
-                view(increment, wp.vec3d),
-                view(report, wp.int32),
-                view(error, wp.float64),
+                *(as_argument(vector, wp.float64) for vector in scalars),
+                as_argument(force, wp.float64),
+                as_argument(increment, wp.vec3d),
+                as_argument(report, wp.int32),
+                as_argument(error, wp.float64),
             ],
             device=warp_device,
         )

@@ -15,10 +15,10 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
-from warpgarment.kernels.linear.conjugate_gradients import System, view
 from warpgarment.kernels.linear.factor import Factor
+from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.operator import allocate
 
 from . import forces_factor_cpu, forces_inverse_cpu, forces_inverse_gpu
@@ -113,11 +113,11 @@ def collision_solve(
             contact_gap,
             dim=len(vertices),
             inputs=[
-                view(vertices, wp.vec3),
-                view(normal, wp.vec3d),
-                view(closest, wp.vec3d),
+                as_argument(vertices, wp.vec3),
+                as_argument(normal, wp.vec3d),
+                as_argument(closest, wp.vec3d),
                 float(epsilon),
-                view(gap, wp.float64),
+                as_argument(gap, wp.float64),
             ],
             device=device,
         )

@@ -23,25 +23,16 @@ iteration for 5,000 vertices, hardly more than float32 (0.16 ms), and leaves no 
 
 from __future__ import annotations
 
-import warnings
-from typing import NamedTuple
-
-import numpy as np
-import scipy.sparse
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import descriptor, torch_stream
+from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
+
+from .system import System, block_dim, block_sum
 
 WINDOW = 8
 _WINDOW = wp.constant(WINDOW)  # as the kernels see it
-
-
-@wp.func
-def block_sum(value: wp.float64) -> wp.float64:
-    """Sum over the lanes of a block, handed to all; also a barrier: what was written before is visible after."""
-    return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
 
 
 @wp.func
@@ -163,43 +154,6 @@ def conjugate_gradients(
         error[component] = wp.sqrt(wp.max(left, window))
 
 
-class System(NamedTuple):
-    """The constant part of the systems of a packed batch, on one device."""
-
-    start: torch.Tensor
-    """int32 [C+1], where the vertices of a component begin in `rows`."""
-    rows: torch.Tensor
-    """int32 [V], vertices sorted by component."""
-    row_pointer: torch.Tensor
-    column: torch.Tensor
-    value: torch.Tensor
-    diagonal: torch.Tensor
-
-    @classmethod
-    def build(cls, matrix: scipy.sparse.csr_matrix, vertex_component: np.ndarray, count: int, device: object) -> System:
-        """Moves a host matrix [V,V] to the device. No entry may join two components."""
-        matrix = matrix.tocsr()
-        rows = np.argsort(vertex_component, kind="stable").astype(np.int32)
-        start = np.searchsorted(vertex_component[rows], np.arange(count + 1)).astype(np.int32)
-        host = (start, rows, matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data)
-        return cls(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in (*host, matrix.diagonal())))
-
-
-def view(tensor: torch.Tensor, dtype: type) -> object:
-    """The descriptor of a contiguous tensor as a launch argument; keeps nothing alive and costs a tenth of an array."""
-    if tensor.numel() == 0:
-        tensor = tensor.new_empty(tensor.shape)  # slices of nothing have strides that Warp refuses
-    return descriptor(tensor, dtype)
-
-
-def block_dim(device: torch.device, vertices: int, count: int) -> int:
-    """Lanes of a block: the CPU has one; a GPU takes more for large components than for small ones."""
-    if device.type == "cpu":
-        return 256 if wp.config.enable_cpu_blocks else 1
-    mean = vertices / max(count, 1)
-    return 128 if mean < 256 else 256 if mean < 4096 else 512
-
-
 def solve(
     system: System | list[torch.Tensor],
     normal: torch.Tensor,
@@ -227,82 +181,28 @@ def solve(
     report, error = allocate((count,), torch.int32, rhs.device), allocate((count,), torch.float64, rhs.device)
     if count == 0:
         return solution, report, error
-    integers = [view(t, wp.int32) for t in (system.start, system.rows, system.row_pointer, system.column)]
+    integers = [as_argument(t, wp.int32) for t in (system.start, system.rows, system.row_pointer, system.column)]
     with torch_stream(rhs.device) as device:
         wp.launch_tiled(
             conjugate_gradients,
             dim=[count],
             inputs=[
                 *integers,
-                view(system.value, wp.float64),
-                view(system.diagonal, wp.float64),
-                view(normal, wp.vec3d),
-                view(rhs, wp.vec3d),
-                view(tolerance, wp.float64),
+                as_argument(system.value, wp.float64),
+                as_argument(system.diagonal, wp.float64),
+                as_argument(normal, wp.vec3d),
+                as_argument(rhs, wp.vec3d),
+                as_argument(tolerance, wp.float64),
                 float(relative),
                 int(max_iterations),
-                view(residual, wp.vec3d),
-                view(direction, wp.vec3d),
-                view(image, wp.vec3d),
-                view(solution, wp.vec3d),
-                view(report, wp.int32),
-                view(error, wp.float64),
+                as_argument(residual, wp.vec3d),
+                as_argument(direction, wp.vec3d),
+                as_argument(image, wp.vec3d),
+                as_argument(solution, wp.vec3d),
+                as_argument(report, wp.int32),
+                as_argument(error, wp.float64),
             ],
             block_dim=block_dim(rhs.device, vertices, count),
             device=device,
         )
     return solution, report, error
-
-
-class Progress:
-    """What the last solve of a solver reported. Reading it on a GPU waits for the solve."""
-
-    def __init__(self, what: str) -> None:
-        self.what = what
-        self._solves: list[tuple[torch.Tensor, torch.Tensor]] = []
-        self._limit = 0
-        self._warned = False
-
-    def record(self, report: torch.Tensor, error: torch.Tensor, limit: int, *, add: bool = False) -> None:
-        """Keeps a report, beside the earlier ones if `add`; on the CPU it is looked at straight away."""
-        self._solves = [*(self._solves if add else []), (report, error)]
-        self._limit = limit
-        if report.device.type == "cpu":
-            self._warn(report, error)
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of the last solve, the largest of all components; solves recorded together are summed."""
-        for solve in self._solves:
-            self._warn(*solve)
-        return sum(int(report.abs().max()) for report, _ in self._solves if len(report))
-
-    def summary(self) -> torch.Tensor:
-        """`iterations`, components stopped by the limit, their largest error [m]; float64 [3] on the device.
-
-        Does not wait for the solve: hand it to `tell` once it has been read.
-        """
-        reports, errors = (torch.stack(tensors) for tensors in zip(*self._solves, strict=True))
-        if not reports.shape[1]:
-            return errors.new_zeros(3)
-        stopped = reports < 0
-        iterations = reports.abs().amax(1).sum()
-        return torch.stack([iterations.double(), stopped.sum().double(), torch.where(stopped, errors, 0.0).max()])
-
-    def tell(self, stopped: float, components: int, error: float) -> None:
-        """Warns, once, if components were stopped by the limit."""
-        if self._warned or not stopped:
-            return
-        self._warned = True
-        warnings.warn(
-            f"{self.what}: {int(stopped)} of {components} components stopped at max_iterations={self._limit} "
-            f"with an error of about {error:.1e} m in the energy norm; raise max_iterations, "
-            "or look for slivers in the rest mesh",
-            RuntimeWarning,
-            stacklevel=5,
-        )
-
-    def _warn(self, report: torch.Tensor, error: torch.Tensor) -> None:
-        stopped = report < 0
-        if not self._warned and bool(stopped.any()):
-            self.tell(int(stopped.sum()), len(report), float(error[stopped].max()))

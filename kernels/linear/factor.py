@@ -40,7 +40,7 @@ import torch
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from .conjugate_gradients import System
+from .system import System
 
 BUDGET = 2**26
 """Numbers in all factors of a solver together, 8 bytes each and half as much for indices (768 MiB)."""

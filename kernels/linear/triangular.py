@@ -19,11 +19,11 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
 
-from .conjugate_gradients import System, block_dim, block_sum, view
 from .factor import Factor
+from .system import System, block_dim, block_sum
 
 LANES = 32
 """Lanes that share a row on a GPU."""
@@ -231,27 +231,27 @@ def solve(
     """
     if len(rhs) == 0 or not int(factor.counts[0]):
         return
-    common = [view(system.start, wp.int32), view(system.rows, wp.int32)]
-    load, result = view(rhs, wp.vec3d), view(solution, wp.vec3d)
+    common = [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32)]
+    load, result = as_argument(rhs, wp.vec3d), as_argument(solution, wp.vec3d)
     with torch_stream(rhs.device) as device:
         if not int(factor.counts[2]):
             scratch = allocate((int(factor.counts[3]), 4), torch.float64, rhs.device)
-            inputs = [*common, *substitution(factor), load, view(scratch, wp.vec4d), result]
+            inputs = [*common, *substitution(factor), load, as_argument(scratch, wp.vec4d), result]
             wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
             return
-        base, order = view(factor.base, wp.int32), view(factor.order, wp.int32)
+        base, order = as_argument(factor.base, wp.int32), as_argument(factor.order, wp.int32)
         columns, rows = (
-            [view(pointer, wp.int32), view(column, wp.int32), view(value, wp.float64)]
+            [as_argument(pointer, wp.int32), as_argument(column, wp.int32), as_argument(value, wp.float64)]
             for pointer, column, value in (
                 (factor.pointer, factor.column, factor.value),
                 (factor.row_pointer, factor.row_column, factor.row_value),
             )
         )
-        common += [view(vertex_component, wp.int32), base, order]
+        common += [as_argument(vertex_component, wp.int32), base, order]
         scratch = allocate(rhs.shape, torch.float64, rhs.device)
-        work = view(scratch, wp.vec3d)
+        work = as_argument(scratch, wp.vec3d)
         block = LANES if rhs.is_cuda else block_dim(rhs.device, len(rhs), 1)
-        first = [*common, view(factor.pivot, wp.float64), *rows, load, work]
+        first = [*common, as_argument(factor.pivot, wp.float64), *rows, load, work]
         second = [*common, *columns, work, result]
         wp.launch_tiled(multiply_lower, dim=[len(rhs)], inputs=first, block_dim=block, device=device)
         wp.launch_tiled(multiply_upper, dim=[len(rhs)], inputs=second, block_dim=block, device=device)
@@ -259,12 +259,12 @@ def solve(
 
 def substitution(factor: Factor) -> list[object]:
     """A factor in the form for substitution as launch arguments, `base` to `value` of `substitute`."""
-    integers = [view(t, wp.int32) for t in (factor.base, factor.first, factor.order)]
+    integers = [as_argument(t, wp.int32) for t in (factor.base, factor.first, factor.order)]
     return [
         *integers,
-        view(factor.pivot.view(-1, 4), wp.vec4d),
-        view(factor.triangle, wp.mat44d),
-        view(factor.pointer, wp.int32),
-        view(factor.column, wp.int32),
-        view(factor.value.view(-1, 4), wp.vec4d),
+        as_argument(factor.pivot.view(-1, 4), wp.vec4d),
+        as_argument(factor.triangle, wp.mat44d),
+        as_argument(factor.pointer, wp.int32),
+        as_argument(factor.column, wp.int32),
+        as_argument(factor.value.view(-1, 4), wp.vec4d),
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warpgarment.kernels.linear.conjugate_gradients import block_sum
+from warpgarment.kernels.linear.system import block_sum
 
 FREE = wp.constant(0)  # translation from `mean`
 PINNED = wp.constant(1)  # translation from the pins

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
-from warpgarment.kernels.linear.conjugate_gradients import System, block_dim, view
 from warpgarment.kernels.linear.factor import Factor
+from warpgarment.kernels.linear.system import System, block_dim
 from warpgarment.kernels.operator import allocate
 
 from .kernels import phi_adjoint, place, place_adjoint, right_hand_side
@@ -40,11 +40,11 @@ _FACTOR = _SYSTEM + len(System._fields)
 
 def _views(model: list[torch.Tensor]) -> dict[str, object]:
     names = zip(MODEL, model[:_SYSTEM], strict=True)
-    return {name: view(tensor, dtype) for (name, dtype), tensor in names if dtype is not None}
+    return {name: as_argument(tensor, dtype) for (name, dtype), tensor in names if dtype is not None}
 
 
 def _start_rows(model: list[torch.Tensor]) -> list[object]:
-    return [view(tensor, wp.int32) for tensor in model[_SYSTEM : _SYSTEM + 2]]
+    return [as_argument(tensor, wp.int32) for tensor in model[_SYSTEM : _SYSTEM + 2]]
 
 
 def _solve(
@@ -97,17 +97,17 @@ def poisson_solve(
             right_hand_side,
             dim=len(guess),
             inputs=[
-                view(tensors["faces"], wp.vec3i),
-                view(tensors["half_cotangent"], wp.vec3d),
+                as_argument(tensors["faces"], wp.vec3i),
+                as_argument(tensors["half_cotangent"], wp.vec3d),
                 m["corner_start"],
                 m["corners"],
                 m["corner_edge"],
                 m["pin_of_vertex"],
                 m["pin_stiffness"],
-                view(phi, wp.mat33),
-                view(guess, wp.vec3d),
-                view(pin_target, wp.vec3),
-                view(rhs, wp.vec3d),
+                as_argument(phi, wp.mat33),
+                as_argument(guess, wp.vec3d),
+                as_argument(pin_target, wp.vec3),
+                as_argument(rhs, wp.vec3d),
             ],
             device=device,
         )
@@ -119,10 +119,10 @@ def poisson_solve(
                 *_start_rows(model),
                 m["kind"],
                 m["centroid_weight"],
-                view(guess, wp.vec3d),
-                view(increment, wp.vec3d),
-                view(mean, wp.vec3),
-                view(vertices, wp.vec3),
+                as_argument(guess, wp.vec3d),
+                as_argument(increment, wp.vec3d),
+                as_argument(mean, wp.vec3),
+                as_argument(vertices, wp.vec3),
             ],
             block_dim=block_dim(phi.device, len(guess), count),
             device=device,
@@ -160,9 +160,9 @@ def poisson_solve_backward(
                 *_start_rows(model),
                 m["kind"],
                 m["centroid_weight"],
-                view(grad_vertices, wp.vec3),
-                view(rhs, wp.vec3d),
-                view(grad_mean, wp.vec3),
+                as_argument(grad_vertices, wp.vec3),
+                as_argument(rhs, wp.vec3d),
+                as_argument(grad_mean, wp.vec3),
             ],
             block_dim=block_dim(mean.device, len(rhs), count),
             device=device,
@@ -176,8 +176,8 @@ def poisson_solve_backward(
                 m["rest_vertices"],
                 m["faces"],
                 m["half_cotangent"],
-                view(adjoint, wp.vec3d),
-                view(grad_phi, wp.float32),
+                as_argument(adjoint, wp.vec3d),
+                as_argument(grad_phi, wp.float32),
             ],
             device=device,
         )

@@ -35,7 +35,8 @@ import torch
 
 from warpgarment.kernels.launch import expect
 from warpgarment.kernels.linear import factor
-from warpgarment.kernels.linear.conjugate_gradients import Progress, System
+from warpgarment.kernels.linear.progress import Progress
+from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.mesh.laplacian import as_numpy, components, cotangent_laplacian, half_cotangents
 
 from .kernels import FREE, ISOLATED, PINNED

@@ -24,12 +24,11 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.collision.body_contacts import closest_on_triangle
 from warpgarment.kernels.launch import as_argument, expect, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import Bodies, closest_on_body
+from .closest import Bodies, closest_on_body, closest_on_triangle
 
 STANDS_OUT = wp.constant(0.01)
 """l [m]. Of what stands out further, vertices that are lower down are found; a bare spike is missed."""

@@ -10,7 +10,6 @@ import itertools
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,12 @@ import numpy as np
 
 from warpgarment.io.atomic import atomic_file, atomic_folder
 
+from .card_facts import Facts, Values
 from .card_page import page
 from .card_pictures import bars, contact_sheet, histograms
 from .layout import SPLITS
-from .sequence import list_sequences, read_manifest
-from .set_manifest import read_set_manifest
 
 PICTURES = 12
-Values = dict[str, dict[str, list[float]]]  # quantity -> split -> one value a sequence or garment
 _FIGURES = {  # of the quality gate: heading, factor
     "penetration": ("deepest vertex [mm]", 1e3),
     "inside": ("vertices inside the body [%]", 1e2),
@@ -42,25 +39,6 @@ _MATERIALS = {
     "damping": ("damping [µs]", 1e6),
     "friction": ("friction", 1.0),
 }
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What the page is about: manifests of good and of rejected sequences, and their folders."""
-
-    root: Path
-    common: dict[str, Any]
-    good: dict[Path, dict[str, Any]]
-    rejected: list[dict[str, Any]]
-
-    @classmethod
-    def of(cls, root: Path) -> Facts:
-        """Reads the manifests of a set."""
-        manifests = {folder: read_manifest(folder) for folder in list_sequences(root, status=None)}
-        good = {folder: m for folder, m in manifests.items() if m.get("status") == "good"}
-        rejected = [m for m in manifests.values() if m.get("status") == "rejected"]
-        rejected += [attempt for m in manifests.values() for attempt in m.get("rejected_attempts", [])]
-        return cls(root, read_set_manifest(root) or {}, good, rejected)
 
 
 class EmptyDataset(ValueError):

@@ -12,7 +12,7 @@ from .layout import SPLITS
 from .set_manifest import planned_numbers
 
 if TYPE_CHECKING:
-    from .card import Facts, Values
+    from .card_facts import Facts, Values
 
 _HEADINGS = {"bodies": "Body shapes", "figures": "Quality", "materials": "Materials", "wind": "Wind"}
 _CREDITS = {

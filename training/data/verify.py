@@ -244,7 +244,7 @@ def _numbers(entries: list[Entry], manifest: dict[str, Any]) -> Iterable[Problem
 
 def _splits(entries: list[Entry]) -> Iterable[Problem]:
     """Clips and garments both trained and tested on."""
-    from warpgarment.training.generate.recipes import clip_group
+    from .splits import clip_group
 
     clips: dict[str, str] = {}
     garments: dict[str, str] = {}

@@ -27,8 +27,7 @@ import tyro
 from warpgarment.errors import MissingExtra
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.tables.errors import OptionMissing
-from warpgarment.training.tables.options import TableName, TableOptions
+from warpgarment.training.tables.options import OptionMissing, TableName, TableOptions
 from warpgarment.training.tables.protocol import (
     FIGURES,
     METHODS,

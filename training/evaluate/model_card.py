@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,10 +23,11 @@ from warpgarment.io.atomic import atomic_file, atomic_folder
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.data.card import Facts
+from warpgarment.training.data.card_facts import Facts
 from warpgarment.training.data.sequence import Sequence as SequenceOnDisk
 from warpgarment.training.rollouts import predict
 
+from .model_card_cases import Case, Drawn
 from .model_card_page import page, ratio
 from .model_card_pictures import curves, rollout_sheet
 
@@ -38,7 +38,6 @@ RULE = (
     "error that are at least half a second apart; the network above, the teacher below."
 )
 APART = 0.5  # seconds between the frames that are drawn
-AGREE = 0.05  # a rollout made again is expected to have the error it had before, up to this share
 
 
 class CardError(ValueError):
@@ -68,50 +67,6 @@ class ModelCardConfig:
     moments: int = 4
     device: str | None = None
     size: tuple[int, int] = (210, 290)
-
-
-@dataclass(frozen=True)
-class Case:
-    """A sequence that is drawn.
-
-    Attributes:
-        role: "best", "median", "second worst", "worst", or several of them where there are few sequences.
-        row: Its row of the evaluation, from a cold start.
-        ratio: Of the network's error to the skinned garment's; infinite where the network's rollout failed.
-    """
-
-    role: str
-    row: Mapping[str, Any]
-    ratio: float
-
-    @property
-    def file(self) -> str:
-        """Name of its picture."""
-        return self.role.split(",")[0].replace(" ", "_") + ".png"
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A case as it was rolled out again: frames of the sequence that are drawn, and errors [cm] of all predicted ones.
-
-    `errors[k]` belongs to frame k + 1, since frame 0 is given; NaN from where a rollout failed.
-    """
-
-    case: Case
-    moments: list[int]
-    errors: np.ndarray
-
-    @property
-    def error(self) -> float:
-        """Mean over the predicted frames [cm]; NaN for a rollout that failed."""
-        return float(self.errors.mean())
-
-    @property
-    def differs(self) -> bool:
-        """Whether this is not the rollout that was evaluated."""
-        before = self.case.row["network"].get("mean_vertex_error_cm")
-        before = math.nan if before is None else before
-        return not (math.isnan(self.error) and math.isnan(before)) and not abs(self.error - before) <= AGREE * before
 
 
 def write_card(config: ModelCardConfig) -> Path:

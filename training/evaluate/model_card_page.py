@@ -14,9 +14,9 @@ from warpgarment.training.data.card_page import counts, credits, table
 from warpgarment.training.tables.protocol import FIGURES, METHODS, STARTS
 
 if TYPE_CHECKING:
-    from warpgarment.training.data.card import Facts
+    from warpgarment.training.data.card_facts import Facts
 
-    from .model_card import Drawn
+    from .model_card_cases import Drawn
 
 _ERROR = "mean_vertex_error_cm"
 _SCALE = {"max_penetration_m": 1000.0}

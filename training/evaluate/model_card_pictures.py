@@ -16,7 +16,7 @@ from warpgarment.training.data.sequence import Sequence as SequenceOnDisk
 from warpgarment.view import draw
 
 if TYPE_CHECKING:
-    from .model_card import Drawn
+    from .model_card_cases import Drawn
 
 LARGEST = 400_000  # bytes of a picture
 

@@ -14,7 +14,7 @@ from warpgarment.training.meshes.cutting import boundary_loops
 from .layers import Sheet
 
 if TYPE_CHECKING:
-    from .make import Pattern
+    from .pattern import Pattern
 
 _LOOPS = {"tshirt": 4, "top": 4, "dress": 4, "jumpsuit": 5, "trousers": 3, "skirt": 2, "jacket": 3, "hooded_jacket": 3}
 

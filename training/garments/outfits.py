@@ -20,7 +20,8 @@ from warpgarment.training.bodies.anny import RestBody
 from warpgarment.training.meshes.cutting import averaging, remeshed
 
 from .layers import Sheet
-from .make import Pattern, make_garment, sampled_pattern
+from .make import make_garment
+from .pattern import Pattern, sampled_pattern
 
 TWO = (
     ("tshirt", "trousers"),

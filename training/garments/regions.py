@@ -12,16 +12,12 @@ import numpy as np
 
 from warpgarment.training.bodies.anny import RestBody
 
+from .pattern import PINNED_NECKLINES, WITH_BODICE, WITH_LEGS, waist
 from .shell import Shell
 
 if TYPE_CHECKING:
-    from .make import Pattern
+    from .pattern import Pattern
 
-WITH_BODICE = ("tshirt", "top", "dress", "jumpsuit", "jacket", "hooded_jacket")
-WITH_LEGS = ("trousers", "jumpsuit")
-WITH_TUBE = ("tshirt", "top", "skirt", "dress", "jacket", "hooded_jacket")
-JACKETS = ("jacket", "hooded_jacket")
-PINNED_NECKLINES = ("straps", "strapless")
 _FAR = 9.0
 _NECK = 0.075  # half of the narrowest neckline [m]
 _WAIST_EASE = 0.012
@@ -49,11 +45,6 @@ def ease_field(body: RestBody, pattern: Pattern) -> np.ndarray:
     if pattern.category == "hooded_jacket":
         ease += pattern.hood * _step(body.weight_of("Neck"), 0.1, 0.6)
     return ease
-
-
-def waist(body: RestBody, pattern: Pattern) -> float:
-    """Height of the waistline [m]."""
-    return float(body.joint("LowerBack")[1] + 0.06 + pattern.waist)
 
 
 def bottom(body: RestBody, pattern: Pattern) -> float:

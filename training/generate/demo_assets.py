@@ -16,7 +16,8 @@ import numpy as np
 
 from warpgarment.training.bodies.anny import anny_bodies
 from warpgarment.training.bodies.skeleton import arms_abducted, blended_in, facing_forward, posed
-from warpgarment.training.garments.make import Pattern, make_garment
+from warpgarment.training.garments.make import make_garment
+from warpgarment.training.garments.pattern import Pattern
 from warpgarment.training.motions.procedural import procedural
 from warpgarment.training.teachers import Cloth, ClothScene
 from warpgarment.training.teachers.newton.teacher import NewtonTeacher

@@ -18,10 +18,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from warpgarment.training.garments.make import CATEGORIES, sampled_pattern
+from warpgarment.objects.material import Material
+from warpgarment.training.data.splits import split_of_clips, split_of_number
 from warpgarment.training.garments.outfits import OutfitPattern, sampled_outfit
+from warpgarment.training.garments.pattern import CATEGORIES, sampled_pattern
 from warpgarment.training.garments.seams import Seams, sampled_seams
-from warpgarment.training.materials import Material, sampled_material
+from warpgarment.training.materials import sampled_material
 from warpgarment.training.motions.clips import clip_frames, list_clips
 from warpgarment.training.motions.procedural import KINDS
 
@@ -29,7 +31,6 @@ from .wind import Wind, sampled_wind
 
 FPS = 30.0
 BLEND = 30
-SPLITS = ("train", "validation", "test")
 TRAINING_CUTS, TEST_CUTS = 10, 2
 GAP = 0.011  # least distance of a single garment from the body at the start [m]
 
@@ -198,24 +199,6 @@ class Plan:
     def name(self) -> str:
         """The sequence's folder."""
         return f"{self.number:05d}_{self.category}"
-
-
-def split_of_number(number: int) -> str:
-    """Which split a sequence belongs to: of 24, three are for testing and one for validation (200 : 10 : 30 of 240)."""
-    return "test" if number % 8 == 3 else "validation" if number % 24 == 5 else "train"
-
-
-def clip_group(name: str) -> str:
-    """Clips of the same performance share a group: the two partners of a salsa are numbered 01-15 and 16-30."""
-    salsa = re.search(r"salsa_(\d+)", name)
-    return f"salsa_{(int(salsa.group(1)) - 1) % 15 + 1:02d}" if salsa else name
-
-
-def split_of_clips(names: list[str]) -> dict[str, str]:
-    """Splits clips by performance: every sixth group is for testing, every twelfth for validation."""
-    groups = sorted({clip_group(n) for n in names})
-    held = {g: "test" if i % 6 == 2 else "validation" if i % 12 == 5 else "train" for i, g in enumerate(groups)}
-    return {n: held[clip_group(n)] for n in names}
 
 
 def plan_sequence(config: GenerateConfig, number: int, attempt: int = 0) -> Plan:

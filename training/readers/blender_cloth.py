@@ -22,7 +22,7 @@ import numpy as np
 
 from warpgarment.kernels.wind import AIR_DENSITY, DRAG
 from warpgarment.objects.garment import Garment
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 
 MIDDLE_MASS = 0.5  # of D-LAYERS' 0.2 to 0.8, Blender's mass of a vertex
 

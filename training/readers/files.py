@@ -19,7 +19,7 @@ from warpgarment.errors import MeshError
 from warpgarment.io.mesh import read_mesh
 from warpgarment.io.sequence import SequenceData, read_sequence
 from warpgarment.objects.body import BodyMotion
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 
 from .recording import RecordedGarment, Recording, recorded_garment
 

@@ -13,7 +13,7 @@ from warpgarment.geometry.checks import checked_fps, checked_positions
 from warpgarment.geometry.clean import clean_mesh
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 
 from .smpl import SmplPoses
 

@@ -27,10 +27,10 @@ from warpgarment.kernels.deformation.gradients import deformation_gradient_from_
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.flops import step_flops
 from warpgarment.nn.heading import rotation_about_up
 from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.nn.patches.layout import Patches, PatchLayout, patch_layout
-from warpgarment.training.flops import step_flops
 
 from .augmentation import Augmentation, mirror
 from .interactions import COLUMNS, unpack

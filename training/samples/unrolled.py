@@ -16,12 +16,12 @@ from warpgarment.kernels.deformation.gradients import face_centroids, segment_me
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.flops import step_flops
 from warpgarment.nn.heading import rotation_about_up
 from warpgarment.objects.pack import PackedBodies
 from warpgarment.sim.history import History
 from warpgarment.sim.scene import Scene
 from warpgarment.sim.timing import Timings
-from warpgarment.training.flops import step_flops
 
 from .augmentation import Augmentation
 from .interactions import COLUMNS, unpack

@@ -13,7 +13,7 @@ from warpgarment.training.train.run import NonFiniteLoss
 from warpgarment.training.train.training_set import folders_of
 
 from . import recipe, variants
-from .errors import DataLacks, OptionMissing
+from .options import DataLacks, OptionMissing
 from .pictures import bars, sweeps
 from .protocol import evenly, means, measure
 from .report import BASELINES, PROTOCOL, means_table, publish

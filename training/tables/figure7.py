@@ -18,8 +18,8 @@ from warpgarment.training.rollouts import predict
 from warpgarment.training.train.training_set import folders_of
 from warpgarment.view import draw
 
-from .errors import DataLacks, OptionMissing
 from .meshing import remesh, surface_distance
+from .options import DataLacks, OptionMissing
 from .pictures import axes_of, results_file, save
 from .protocol import STARTS, Known, evenly
 from .report import grid, publish

@@ -14,7 +14,7 @@ from warpgarment.training.data.set_manifest import read_set_manifest
 from warpgarment.training.generate.recipes import TRAINING_CUTS
 from warpgarment.training.train.training_set import folders_of
 
-from .errors import DataLacks, OptionMissing
+from .options import DataLacks, OptionMissing
 from .pictures import Keeper, bars, results_file, rollouts
 from .protocol import evenly, means, measure
 from .report import PROTOCOL, means_table, publish

@@ -16,8 +16,8 @@ from warpgarment.training.rollouts import predict
 from warpgarment.training.train.training_set import folders_of
 from warpgarment.view import draw
 
-from .errors import DataLacks, OptionMissing
 from .long_rollout import STILL, Limits, extended, figures, judged, settled, vertex_areas, walk
+from .options import DataLacks, OptionMissing
 from .pictures import axes_of, save
 from .protocol import STARTS, Known, evenly
 from .report import grid, publish

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training.baselines import kabsch
+from warpgarment.training.rollouts import kabsch
 
 TURN = 12  # w: frames that slowing down takes
 SETTLING = 60  # frames after the start that a garment may take to find its place and speed

@@ -43,3 +43,11 @@ class TableOptions:
     faces: tuple[int, ...] = (1000, 2000, 5000)
     long_frames: int = 1000
     garments: tuple[str, ...] = ("dress", "tshirt")
+
+
+class OptionMissing(ValueError):
+    """An option that the evaluation needs was not given."""
+
+
+class DataLacks(ValueError):
+    """The data set has nothing that this table compares; says which command makes it."""

@@ -21,9 +21,8 @@ from warpgarment import metrics
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
-from warpgarment.training.baselines import rigid, skinned
 from warpgarment.training.data.sequence import Sequence
-from warpgarment.training.rollouts import predict
+from warpgarment.training.rollouts import predict, rigid, skinned
 from warpgarment.training.train.training_set import reason_of
 
 METHODS = ("network", "skinned", "rigid")

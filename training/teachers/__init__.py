@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 
 TEACHERS = ("newton", "blender")
 LAYER_FRICTION = 0.2  # between cloths: Newton has one coefficient for all worlds it simulates at once
@@ -116,7 +116,8 @@ def make_teacher(name: Literal["newton", "blender"], device: str | None = "cpu")
         TeacherError: Blender's environment has not been made.
     """
     if name == "newton":
-        from warpgarment.training.teachers.newton.teacher import NewtonSettings, NewtonTeacher
+        from warpgarment.training.teachers.newton.settings import NewtonSettings
+        from warpgarment.training.teachers.newton.teacher import NewtonTeacher
 
         return NewtonTeacher(NewtonSettings(layer_friction=LAYER_FRICTION), device=device)
     if name == "blender":

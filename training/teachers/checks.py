@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import j0
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.materials import Material
+from warpgarment.objects.material import Material
 
 from . import Cloth, ClothScene, Teacher
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from warpgarment.training.flops import matrix_peak
+from warpgarment.nn.flops import matrix_peak
 
 
 class Rate:

@@ -25,10 +25,10 @@ import torch
 
 from warpgarment.io.atomic import atomic_file
 from warpgarment.nn import checkpoint
+from warpgarment.nn.faces.grow import grow
 from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
 from warpgarment.nn.patches.network import PatchTransformer
 from warpgarment.training.distributed import Group, GroupError
-from warpgarment.training.grow import grow
 from warpgarment.training.samples.loader import Plan
 from warpgarment.training.samples.single_step import SampleBuilder
 

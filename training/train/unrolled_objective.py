@@ -39,7 +39,7 @@ from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.nn.heading import canonical_frame
 from warpgarment.nn.network import rotate_output
 from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
-from warpgarment.objects.pack import PaddedView
+from warpgarment.nn.rows import PaddedView
 from warpgarment.training.samples.augmentation import mirror
 from warpgarment.training.samples.unrolled import UnrolledBatch, turned
 

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from warpgarment.errors import UsageError
+
 _ROOM = "warpgarment"
 _EXTRAS = {
     "newton": "physics",
@@ -117,10 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise  # not one of the errors that name a remedy: somebody has to see where it came from
         return _complain(f"{type(error).__name__}: {error}")
     return 0
-
-
-class UsageError(ValueError):
-    """Options that parse but do not fit each other or the files they name."""
 
 
 MOTION_FORMATS = (".usd", ".usda", ".usdc", ".pc2", ".npz", "")

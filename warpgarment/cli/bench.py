@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from warpgarment import demo
+from warpgarment.errors import UsageError
 from warpgarment.view.report import STAGES, table
-
-from . import UsageError
 
 
 @dataclass

@@ -10,7 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-from . import _EXTRAS, UsageError
+from warpgarment.errors import UsageError
+
+from . import _EXTRAS
 
 _CORE = ("warpgarment", "warp-lang", "torch", "numpy", "scipy", "trimesh", "libigl", "safetensors")
 

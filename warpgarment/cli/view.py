@@ -7,12 +7,12 @@ from pathlib import Path
 
 import tyro
 
-from warpgarment.errors import MissingExtra
+from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.view import draw
 
-from . import UsageError, check_output
+from . import check_output
 
 
 @dataclass

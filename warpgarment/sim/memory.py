@@ -23,9 +23,10 @@ from warpgarment.kernels.collision import compliance
 from warpgarment.kernels.features.face import FEATURES
 from warpgarment.kernels.linear import factor
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.rows import row_groups
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.objects.pack import PackedBodies, row_groups
+from warpgarment.objects.pack import PackedBodies
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes: rest frames, indices; sparse matrices and vectors of the solvers

@@ -18,15 +18,16 @@ from warpgarment.kernels.deformation.face_means import FaceMeans
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
 from warpgarment.kernels.deformation.next_frame import next_gradients
 from warpgarment.kernels.features.carry import carried, face_at_each_vertex
-from warpgarment.kernels.features.frame_features import frame_features
+from warpgarment.kernels.features.face import frame_features
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.surface_depth import SurfaceDepth
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context
+from warpgarment.nn.rows import padded_views
 from warpgarment.objects.clearance import clearance
 from warpgarment.objects.garment import Garment
-from warpgarment.objects.pack import PackedBodies, PackedGarments, padded_views
+from warpgarment.objects.pack import PackedBodies, PackedGarments
 
 from . import differentiable, memory
 from .graph import GraphedFrames

@@ -23,10 +23,12 @@ from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.pack import PackedBodies
 
+from .advance import advance
 from .arguments import as_array, counted, known_frames, listed, per_garment
-from .frame import READ_EVERY, Frame, Recording, advance
+from .frame import Frame
 from .graph import GraphedFrames
 from .history import History
+from .recording import READ_EVERY, Recording
 from .scene import Scene
 from .state import SimulationState
 from .timing import Timings

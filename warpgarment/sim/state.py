@@ -6,7 +6,8 @@ import dataclasses
 from functools import cached_property
 from typing import Any
 
-from .frame import Frame, Outcome, read
+from .frame import Frame
+from .recording import Outcome, read
 from .scene import Scene
 
 

@@ -17,9 +17,10 @@ from warpgarment.training.teachers import ClothScene
 from warpgarment.training.teachers.scenes import MovingFrame, bound_to_body, used_body
 
 from .kernels import set_bodies_kernel, set_pins_kernel
+from .settings import _mean_friction, layer_friction
 
 if TYPE_CHECKING:
-    from .teacher import NewtonSettings
+    from .settings import NewtonSettings
 
 REACH = 5.0  # metres about a body's first pose within which it is looked for
 
@@ -211,15 +212,6 @@ class Worlds:
             wp.array(weights.astype(np.float32), dtype=wp.vec3),
             wp.array(height.astype(np.float32), dtype=float),
         ]
-
-
-def layer_friction(scene: ClothScene, settings: NewtonSettings) -> float:
-    """The coefficient between cloths, of which a model has one."""
-    return _mean_friction(scene) if settings.layer_friction is None else settings.layer_friction
-
-
-def _mean_friction(scene: ClothScene) -> float:
-    return float(np.mean([cloth.material.friction for cloth in scene.cloths]))
 
 
 def _world(newton: Any, scene: ClothScene, body_points: np.ndarray, body_faces: np.ndarray, settings: NewtonSettings):

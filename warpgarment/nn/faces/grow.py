@@ -24,8 +24,9 @@ from torch import nn
 
 from warpgarment.nn.attention import EncoderLayer
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.nn.network import STATISTICS
+
+from .network import ManifoldAwareTransformer
 
 MAY_DIFFER = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "dropout")
 UNEVEN = 0.5  # how far the shares of the copies of a channel are from equal

@@ -31,7 +31,8 @@ from __future__ import annotations
 import torch
 
 from warpgarment.kernels.features.face import FEATURES
-from warpgarment.nn.config import NetworkConfig
+
+from .config import NetworkConfig
 
 PEAKS = (  # part of the device's name, dense bfloat16 with float32 sums [FLOP/s]; the makers' data sheets
     ("B200", 2250e12),

@@ -1,0 +1,82 @@
+"""Reading what the host wants to know of a batch's frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from warpgarment.objects.status import RolloutStatus
+
+from .scene import Scene
+
+READ_EVERY = 16  # frames of a rollout that a GPU computes before the host looks at them
+
+
+class Outcome(NamedTuple):
+    """A frame as the host sees it."""
+
+    parts: list[np.ndarray]  # positions of each garment [V,3]; NaN for one that has failed
+    statuses: list[RolloutStatus]
+    alive: bool  # whether any garment is finite
+
+
+def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -> list[Outcome]:
+    """Reads frames from the device, all in one go, and warns of solves that did not converge.
+
+    Args:
+        scene: Theirs.
+        first: Number of the first frame.
+        frames: `Frame.outcome` of this and the following frames.
+    """
+    positions, finite, depth, solves = (torch.stack(tensors).cpu().numpy() for tensors in zip(*frames, strict=True))
+    found = []
+    for k in range(len(frames)):
+        parts = [part.copy() for part in scene.packed.split(positions[k])]
+        for part, sound in zip(parts, finite[k], strict=True):
+            if not sound:
+                part[:] = np.nan
+        scene.tell(solves[k])
+        iterations = [int(n) for n in solves[k, :, 0]]
+        judged = zip(finite[k], depth[k], strict=True)
+        statuses = [RolloutStatus.judged(first + k, bool(f), float(d), *iterations) for f, d in judged]
+        found.append(Outcome(parts, statuses, bool(finite[k].any())))
+    return found
+
+
+class Recording:
+    """What a rollout keeps of its frames, read from the device some frames at a time.
+
+    Args:
+        scene: Of the rollout.
+        lengths: Frames of each garment; later ones are not kept, nor what follows a frame that is not finite.
+        every: Frames that are read together.
+    """
+
+    def __init__(self, scene: Scene, lengths: Sequence[int], every: int) -> None:
+        self.scene, self.lengths, self.every = scene, lengths, every
+        sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, scene.garments, strict=True)]
+        self.positions = [np.full(size, np.nan, np.float32) for size in sizes]
+        self.statuses: list[list[RolloutStatus]] = [[] for _ in lengths]
+        self._unread: list[tuple[torch.Tensor, ...]] = []
+        self._first = 0  # number of the first frame that was not read
+
+    def add(self, outcome: tuple[torch.Tensor, ...], *, last: bool) -> bool:
+        """Takes the next frame; False once it is known that no garment is finite any more."""
+        self._unread.append(outcome)
+        if len(self._unread) < self.every and not last:
+            return True
+        frames = read(self.scene, self._first, self._unread)
+        first, self._first = self._first, self._first + len(frames)
+        self._unread.clear()
+        for number, frame in enumerate(frames, first):
+            for i, (part, status) in enumerate(zip(frame.parts, frame.statuses, strict=True)):
+                failed = self.statuses[i] and not self.statuses[i][-1].finite
+                if number < self.lengths[i] and not failed:
+                    self.positions[i][number] = part
+                    self.statuses[i].append(status)
+            if not frame.alive:
+                return False
+        return True
