@@ -35,7 +35,7 @@ bench: $(VENV)/.demo
 	$(BIN)/warpgarment bench $(if $(DEVICE),--device $(DEVICE))
 
 gpu: $(VENV)/.test
-	$(BIN)/python -m pytest tests/test_on_gpu.py tests/test_frames_on_device.py tests/test_cuda_compilation.py
+	$(BIN)/python -m pytest tests/sim/test_on_gpu.py tests/sim/test_frames_on_device.py tests/kernels/test_cuda_compilation.py
 	$(BIN)/python -m benchmarks
 
 clean:

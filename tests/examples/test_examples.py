@@ -1,0 +1,66 @@
+"""The examples run, in a shorter setting, and print what they promise."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+
+from warpgarment.objects.motion import GarmentMotion
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+def _run(name: str, **settings) -> None:
+    runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](**settings)
+
+
+def test_every_example_is_tested() -> None:
+    """An example that nothing runs, and that breaks unnoticed."""
+    tested = Path(__file__).read_text()
+    assert all(f'"{path.stem}"' in tested for path in EXAMPLES.glob("*.py"))
+
+
+def test_first_rollout(tmp_path, capsys) -> None:
+    """The first thing a reader tries fails, or prints no figures."""
+    _run("01_first_rollout", out=tmp_path, frames=4)
+    assert "mean vertex error" in capsys.readouterr().out
+    assert {p.name for p in tmp_path.iterdir()} == {"dress.usd", "dress.png"}
+
+
+def test_own_garment_own_body(tmp_path, capsys) -> None:
+    """Files in centimetres, or a body that is no person, come out elsewhere: here more than 1 cm inside the body."""
+    _run("02_own_garment_own_body", out=tmp_path, frames=4)
+    printed = capsys.readouterr().out
+    assert float(printed.split("deepest penetration ")[1].split(" mm")[0]) < 10
+    assert {"bottle.pc2", "sleeve.obj", "sleeve.usd", "sleeve.png"} <= {p.name for p in tmp_path.iterdir()}
+
+
+def test_batch(tmp_path, capsys) -> None:
+    """A batch gives another result than its members one by one: more than 1 mm apart after 3 frames."""
+    _run("03_batch", out=tmp_path, frames=4)
+    apart = [
+        float(line.split(" mm from")[0].split()[-1])
+        for line in capsys.readouterr().out.splitlines()
+        if " mm from" in line
+    ]
+    assert len(apart) == 4
+    assert max(apart) < 1.0
+
+
+def test_live_body(tmp_path, capsys) -> None:
+    """Streaming stops early or loses frames."""
+    _run("04_live_body", out=tmp_path, frames=5)
+    assert "5 frames on" in capsys.readouterr().out
+    motion = GarmentMotion.load(tmp_path / "tshirt.npz")
+    assert motion.frames == 5
+    assert np.isfinite(motion.vertices).all()
+
+
+def test_train_on_own_data(tmp_path, capsys) -> None:
+    """A sequence written as the example says cannot be trained on."""
+    _run("05_train_on_own_data", out=tmp_path, frames=16, steps=2, batch_size=2)
+    printed = capsys.readouterr().out
+    assert "loss" in printed
+    assert "cm from the truth" in printed

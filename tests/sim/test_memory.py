@@ -1,0 +1,143 @@
+"""Predicted memory against what torch allocates, and what is said when a batch does not fit."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from support.scenes import network, skirt, tube, walk
+
+from warpgarment.errors import NotEnoughMemory
+from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
+from warpgarment.kernels.collision.operator import _parts as parts
+from warpgarment.kernels.linear.factor import Factor
+from warpgarment.kernels.poisson.solver import PoissonSolver
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import build_network
+from warpgarment.objects.garment import Garment
+from warpgarment.sim import memory
+from warpgarment.sim.simulator import Simulator
+
+FACTOR = 1.5
+
+
+def garment(around: int, along: int) -> Garment:
+    """A skirt of 2 around (along - 1) faces with made-up distances: real ones take a while and as much memory."""
+    made = Garment(*tube(around, along, bottom=-0.3, top=0.3))
+    centroids = made.vertices[made.faces].mean(axis=1)
+    made.__dict__["geodesics"] = np.linalg.norm(centroids[:, None] - centroids, axis=2).astype(np.float32)
+    return made
+
+
+def allocated(call) -> int:
+    """The most bytes that torch had allocated at a time, above what it had before."""
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
+        call()
+    events = [event for event in profile.profiler.kineto_results.events() if event.name() == "[memory]"]
+    changes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
+    return int(np.cumsum(changes).max())
+
+
+def pooled(around: int, along: int) -> Garment:
+    """The same with made-up distances between centres, as garments beyond 10,000 faces have them."""
+    made = Garment(*tube(around, along, bottom=-0.3, top=0.3))
+    centroids = made.vertices[made.faces].mean(axis=1)
+    centres = centroids[np.linspace(0, len(centroids) - 1, CENTRES).astype(int)]
+    length, nearest = cKDTree(centres).query(centroids, NEAR)
+    weight = 1.0 / (length + 0.01)
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2).astype(np.float32)
+    made.__dict__["pooled_geodesics"] = PooledGeodesics(
+        distances, nearest.astype(np.int32), (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    )
+    return made
+
+
+def factor_of(solver) -> list[torch.Tensor]:
+    """The factor among what a solver's operator is given, found as the solver itself finds it."""
+    return list(solver._model[-len(Factor._fields) :]) if isinstance(solver, PoissonSolver) else parts(solver._model)[2]
+
+
+SMALL, BASE, FAST = (kind(layers=1) for kind in (NetworkConfig.small, NetworkConfig.base, NetworkConfig.fast))
+ONE, MANY = garment(32, 17), [garment(around, 13) for around in (12, 16, 22, 24, 28, 32)]
+
+
+@pytest.mark.parametrize(
+    ("garments", "config", "options"),
+    [
+        ([ONE], SMALL, {}),
+        ([ONE], SMALL, {"face_splits": 4}),
+        (MANY, SMALL, {}),
+        ([MANY[1]] * 8, SMALL, {}),
+        ([MANY[1]] * 8, BASE, {}),
+        ([MANY[1]] * 8, BASE, {"half": True}),
+        ([garment(64, 40)], SMALL, {"face_splits": 8}),
+        ([ONE], FAST, {}),
+        (MANY, FAST, {}),
+        ([MANY[1]] * 8, FAST, {"half": True}),
+        ([pooled(128, 41)], SMALL, {"face_splits": 4}),
+        ([pooled(128, 41)], FAST, {}),
+    ],
+)
+def test_prediction(garments, config, options):
+    """A batch would be refused that fits, or taken that does not. Within 1.5 of torch's own count, setting up included.
+
+    Geodesic distances and factors lie in NumPy's memory and are counted apart. The last three have too many vertices
+    for a compliance matrix, the last two too many faces for a matrix of all pairs of them.
+    """
+    motion = walk(2)
+    splits = {k: v for k, v in options.items() if k == "face_splits"}
+    sim = Simulator(build_network(config), "cpu", half=options.get("half", False))
+    scenes = []
+
+    def run():
+        state = sim.start(garments, motion.vertices[0], motion.faces, **splits)
+        sim.step(state, motion.vertices[1])
+        scenes.append(state.scene)
+
+    unique = {id(g): g for g in garments}.values()
+    arrays = [] if config is FAST else [a for g in unique for a in (g.pooled_geodesics if g.pools else [g.geodesics])]
+    distances = sum(array.nbytes for array in arrays)
+    measured = allocated(run)
+    factors = sum(tensor.nbytes for solver in (scenes[0].poisson, scenes[0].collision) for tensor in factor_of(solver))
+    measured += distances + factors
+    predicted = memory.predict(garments, [motion], config, **options)
+    assert predicted.parts["geodesic distances"] == distances
+    assert 1 / FACTOR < predicted.parts["factors of the solvers"] / factors < FACTOR
+    ratio = (predicted.total - predicted.parts["bodies"]) / measured
+    assert 1 / FACTOR < ratio < FACTOR, f"{predicted}, measured {measured / 1e6:.1f} MB"
+
+
+def test_batches_that_do_not_fit(monkeypatch):
+    """The system would kill the process, or CUDA fail somewhere in the middle. What the message advises must fit."""
+    garments = [garment(20, 13) for _ in range(8)]
+    sim = Simulator(network(), "cpu")
+    needed = memory.predict(garments, [walk(1)], sim.network.config).total
+    monkeypatch.setattr(memory, "free", lambda device: int(0.85 * needed / memory.USABLE))
+    with pytest.raises(NotEnoughMemory, match=r"8 garments need .* MB: .*geodesic weights .*more than") as caught:
+        sim.rollout(garments, walk(2))
+    message = str(caught.value)
+    splits = int(re.search(r"face_splits=(\d+)", message)[1])
+    most = int(re.search(r"at most (\d+) of the 8 garments", message)[1])
+    assert 1 < most < 8
+    sim.rollout(garments, walk(2), face_splits=splits)
+    sim.rollout(garments[:most], walk(2))
+    with pytest.raises(NotEnoughMemory):
+        sim.rollout(garments[: most + 1], walk(2))
+    assert issubclass(NotEnoughMemory, MemoryError)
+
+    monkeypatch.setattr(memory, "free", lambda device: 1000)
+    with pytest.raises(NotEnoughMemory, match="Coarsen the garments"):
+        sim.rollout(skirt(), walk(2))
+    monkeypatch.setattr(memory, "free", lambda device: None)  # not known: nothing is refused
+    sim.rollout(skirt(), walk(2))
+
+
+def test_free_memory():
+    """The limit would be no limit. What Linux says is more than this process has taken, and at most all there is."""
+    available = memory.free("cpu")
+    total = next(line for line in open("/proc/meminfo") if line.startswith("MemTotal"))
+    assert 2**24 < available <= 1024 * int(total.split()[1])

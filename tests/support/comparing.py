@@ -1,0 +1,14 @@
+"""Comparing results of networks."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+
+def close(result: torch.Tensor, expected, tolerance: float) -> None:
+    """Every number finite and near; NaN is never near."""
+    expected = torch.as_tensor(np.asarray(expected), dtype=torch.float64)
+    assert result.shape == expected.shape
+    assert torch.isfinite(result).all()
+    assert (result.double() - expected).abs().max().item() <= tolerance

@@ -1,0 +1,279 @@
+"""Unrolled training: the states of the simulator, the losses of one-step training, gradients of finite differences."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support import sequences as synthetic_sequences
+from support.runs import config_for, entries_of, losses_of
+
+from warpgarment.metrics import mean_vertex_error
+from warpgarment.nn import checkpoint
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.sim import differentiable
+from warpgarment.sim.simulator import Simulator
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.rollouts import predict
+from warpgarment.training.samples import interactions
+from warpgarment.training.samples.augmentation import Augmentation
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.pushforward import PushforwardConfig
+from warpgarment.training.samples.recorded import SequenceData
+from warpgarment.training.samples.single_step import SampleBuilder
+from warpgarment.training.samples.statistics import statistics
+from warpgarment.training.samples.unrolled import UnrolledBuilder
+from warpgarment.training.train import start as train
+from warpgarment.training.train import unrolled_objective as unroll
+from warpgarment.training.train.losses import LossConfig
+from warpgarment.training.train.objective import Objective
+from warpgarment.training.train.unrolled_objective import UnrollConfig, UnrolledObjective
+
+SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.0, geodesic_radius=0.2)
+QUIET = NoiseConfig(position=0.0, offset=0.0)
+PLAIN = Augmentation(mirror=0.0, yaw=0.0)
+T = 11  # newest frame of most samples
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("set") / "sequences"
+    synthetic_sequences.write(root, "train_0", seed=0, frames=18, pins=4)
+    synthetic_sequences.write(root, "train_1", seed=1, frames=18, rings=5)
+    synthetic_sequences.write(root, "validation_0", "validation", seed=2, frames=12)
+    return root
+
+
+@pytest.fixture(scope="module")
+def loaded(data) -> list[SequenceData]:
+    cache = interactions.default_cache(data)
+    return [SequenceData(Sequence.load(f), f, cache, SMALL, torch.device("cpu")) for f in sorted(data.glob("train_*"))]
+
+
+@pytest.fixture
+def network(loaded) -> ManifoldAwareTransformer:
+    """Inputs normalised by the data, outputs by deviations as sets of real garments have them, and not zero."""
+    torch.manual_seed(0)
+    module = ManifoldAwareTransformer(SMALL)
+    builder = SampleBuilder(loaded, SMALL, QUIET, PLAIN)
+    module.set_statistics(statistics([builder.build([(0, 5), (1, 9)], 60, np.random.default_rng(0))], module))
+    module.set_statistics({"psi_std": [0.05] * 9, "singular_value_std": [0.05] * 3, "q_std": [0.003] * 3})
+    for head in (module.face_head, module.velocity_head):
+        torch.nn.init.normal_(head.weight, std=0.1)
+    return module
+
+
+def batch_of(loaded, network, picks, *, steps=3, faces=None, passes=0, augmentation=PLAIN, noise=QUIET, part=None):
+    builder = UnrolledBuilder(loaded, network, noise, augmentation, steps, passes)
+    smallest = min(len(loaded[s].faces) for s, _ in picks)
+    return builder.build(picks, faces or smallest, np.random.default_rng(4), None, part or slice(None))
+
+
+def objective_of(network, **settings) -> UnrolledObjective:
+    unroll = UnrollConfig(**({"steps": 3, "position": 0.0, "collision_passes": 0} | settings))
+    return UnrolledObjective(network, LossConfig(), 0.0, "float32", unroll)
+
+
+@pytest.mark.parametrize(("s", "t", "passes"), [(0, T, 2), (1, T, 0), (0, 0, 2)])
+def test_states_are_those_of_the_simulator(loaded, network, s, t, passes):
+    """Training goes through other states than a rollout: against `Simulator.rollout`, warm with and without pins and
+    collisions, and cold.
+
+    1e-5 m: the same float32 operations, but for cached features of the history.
+    """
+    batch = batch_of(loaded, network, [(s, t)], passes=passes)
+    objective = objective_of(network, position=1.0, collision_passes=passes)
+    with torch.no_grad():
+        states = [vertices for _, vertices, _ in objective.steps(batch)]
+    simulator = Simulator(network, "cpu", collision_passes=passes)
+    expected = predict(simulator, loaded[s].source, t, 3, cold=t == 0)
+    moved = np.abs(expected[-1] - np.array(loaded[s].source.vertices[t + 3])).max()
+    assert moved > 1e-3  # the network does not just repeat the recording
+    np.testing.assert_allclose(torch.stack(states).numpy(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("augmentation", [PLAIN, Augmentation(mirror=1.0, yaw=20.0)])
+def test_one_step_has_the_loss_of_one_step_training(loaded, network, augmentation):
+    """Weights, normalisation, heading, turns or mirror differ from one-step training: for one step of one garment with
+    a history 2 cm off both must have the same losses. (Displaced as a whole: one-step training turns samples by the
+    heading of the recording, a rollout by its own.) 1e-3: one-step training keeps geodesic weights in float16."""
+    noise = NoiseConfig(position=0.0, offset=0.02, clean=0.0, spread=1.0)
+    single = SampleBuilder(loaded, SMALL, noise, augmentation)
+    one = single.build([(1, T)], len(loaded[1].faces), np.random.default_rng(4))
+    expected = Objective(network, LossConfig(), 0.0, "float32")(*Objective.inputs(one))
+
+    stream = np.random.default_rng(4).spawn(1)[0]  # what the sample above drew
+    joint = single._drawn([(1, T)], [stream])[2]
+    stream.permutation(len(loaded[1].faces))
+    delta = loaded[1].noise.displacement(SMALL.history, noise, stream)
+    builder = UnrolledBuilder(loaded, network, QUIET, augmentation, 1, 0)
+    batch = builder.build([(1, T)], len(loaded[1].faces), np.random.default_rng(0), [delta])
+    batch.turn[:], batch.joint[:] = joint, joint
+    assert batch.mirrored.all() == (augmentation.mirror > 0.0)
+    with torch.no_grad():
+        found = objective_of(network, steps=1)(batch)
+    torch.testing.assert_close(found[:4], expected.detach(), rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("which", [0, 4])
+def test_gradients_are_those_of_finite_differences(loaded, network, monkeypatch, which):
+    """A gradient is lost on the way through three steps: between the prediction and the state, in a solve, in the
+    features, or in targets that depend on the state.
+
+    Along random directions of the weights, all uphill so that the slope is far above rounding, for the whole loss (0)
+    and the distance from the recording alone (4). Nearest points are those found at first: they are constants of the
+    gradient. Squares take the place of absolute differences, whose kinks, thousands of them, leave differences off by
+    2 %. 0.5 % of the slope: the loss is curved, and float32 positions, 1e-7 m off, limit differences to some 1e-3.
+    Frames in which no two singular values of a face meet: replacing them is discontinuous there.
+    """
+    found, calls, search = [], [], differentiable.body_interaction
+
+    def remembered(*arguments):
+        calls.append(None)
+        if len(calls) > len(found):
+            found.append(search(*arguments))
+        return found[len(calls) - 1]
+
+    def squares(predicted, target, network, config, face_weight, component_weight):
+        weights, factors = (face_weight, face_weight, component_weight), (1.0, 1.0, 3.0)
+        parts = zip(predicted, target, weights, strict=True)
+        terms = [((a.double() - b.double()).square().sum(dim=-1) * w).sum() for a, b, w in parts]
+        return sum(f * term for f, term in zip(factors, terms, strict=True)), *terms
+
+    monkeypatch.setattr(differentiable, "body_interaction", remembered)
+    monkeypatch.setattr(unroll, "weighted", squares)
+    batch = batch_of(loaded, network, [(0, T + 1), (1, T + 1)])
+    objective, parameters = objective_of(network, position=1.0), list(network.parameters())
+
+    def value() -> torch.Tensor:
+        calls.clear()
+        return objective(batch)[which]
+
+    gradients = torch.autograd.grad(value(), parameters)
+    for seed in range(2):
+        generator = torch.Generator().manual_seed(seed)
+        directions = [
+            torch.rand(p.shape, generator=generator) * p.detach().abs().mean() * g.sign()
+            for p, g in zip(parameters, gradients, strict=True)
+        ]
+        slope = sum((g * d).sum().item() for g, d in zip(gradients, directions, strict=True))
+        step, values = 1e-3, []
+
+        def move(by: float, directions=directions) -> None:
+            with torch.no_grad():
+                for p, d in zip(parameters, directions, strict=True):
+                    p += by * d
+
+        for by in (step, -2.0 * step):
+            move(by)
+            values.append(value().item())  # with gradients, so that the same operators run
+        move(step)
+        assert slope == pytest.approx((values[0] - values[1]) / (2.0 * step), rel=5e-3)
+
+
+def test_parts_of_a_batch_average_to_its_loss(loaded, network):
+    """Several processes would train on other losses than one: garments of different sizes, seen in one piece and in
+    two."""
+    objective, noise = objective_of(network), NoiseConfig()
+    turns = Augmentation(mirror=0.5, yaw=5.0)
+    picks = [(0, T), (1, T), (1, 3), (0, 0)]
+    for faces in (96, 48):
+        losses = [
+            objective(
+                batch_of(loaded, network, picks, faces=faces, augmentation=turns, noise=noise, part=part)
+            ).detach()
+            for part in (slice(None), slice(0, 2), slice(2, 4))
+        ]
+        # a part of the batch is split by its own smallest garment, which here is the same
+        torch.testing.assert_close(torch.stack(losses[1:]).mean(dim=0), losses[0], rtol=1e-4, atol=0.0)
+
+
+def test_three_unrolled_steps_lower_the_rollout_error(loaded, network):
+    """The gradient does not lead to rollouts closer to the recording, which is what it is for."""
+    batch = batch_of(loaded, network, [(1, T)])
+    objective = objective_of(network, position=1000.0)
+
+    def error() -> float:
+        predicted = predict(Simulator(network, "cpu", collision_passes=0), loaded[1].source, T, 3)
+        return mean_vertex_error(predicted, np.array(loaded[1].source.vertices[T + 1 : T + 4]))
+
+    optimizer, errors = torch.optim.AdamW(network.parameters(), lr=1e-3), [error()]
+    for _ in range(3):
+        optimizer.zero_grad()
+        objective(batch)[0].backward()
+        optimizer.step()
+        errors.append(error())
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.9 * errors[0]
+
+
+UNROLLED = {
+    "unroll": UnrollConfig(steps=2, position=1.0), "batch_size": 2, "steps": 6, "save_every": 2, "validate_every": 4,
+    "statistics_batches": 1, "pushforward": PushforwardConfig(every=2, rollouts=2, steps=2, share=0.5),
+}  # fmt: skip
+
+
+def test_a_resumed_unrolled_run_repeats_the_uninterrupted_one(data, tmp_path, monkeypatch):
+    """As for one-step training: bit for bit on the CPU; and the log has the distance from the recording."""
+    train.train(config_for(data, tmp_path / "whole", **UNROLLED))
+    entries = entries_of(tmp_path / "whole")
+    assert [entry["step"] for entry in entries] == list(range(1, 7))
+    for entry in entries:
+        parts = entry["loss_deformation"] + entry["loss_singular_values"] + 3.0 * entry["loss_velocity"]
+        assert entry["loss"] == pytest.approx(parts + entry["position_m"], rel=1e-5)
+        assert 0.0 < entry["position_m"] < 0.05
+        assert entry["samples_per_second"] > 0.0
+    with monkeypatch.context() as patch:
+        over = train.Run.over
+        patch.setattr(train.Run, "over", lambda run: over(run) or run.step >= 3)
+        train.train(config_for(data, tmp_path / "cut", **UNROLLED))
+    train.train(config_for(data, tmp_path / "cut", resume=True, **UNROLLED))
+    assert losses_of(tmp_path / "cut") == losses_of(tmp_path / "whole")
+    ours, theirs = (checkpoint.load(tmp_path / n / "network.safetensors").state_dict() for n in ("cut", "whole"))
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert json.loads((tmp_path / "cut" / "config.json").read_text())["unroll"]["steps"] == 2
+
+
+def test_an_unrolled_loss_that_is_not_finite_stops_the_run(data, tmp_path, monkeypatch):
+    """As for one-step training: the batch is kept."""
+    build = UnrolledBuilder.build
+
+    def poisoned(self, picks, faces, rng, displacements=None, part=slice(None)):
+        batch = build(self, picks, faces, rng, displacements, part)
+        if rng.bit_generator.seed_seq.entropy == (0, 1, 1):
+            batch.recorded[0][0] = torch.nan
+        return batch
+
+    monkeypatch.setattr(UnrolledBuilder, "build", poisoned)
+    settings = UNROLLED | {"validate_sequences": 0, "pushforward": PushforwardConfig(share=0.0)}
+    with pytest.raises(train.NonFiniteLoss, match=r"step 1 .*not_finite_1"):
+        train.train(config_for(data, tmp_path, **settings))
+    saved = np.load(tmp_path / "not_finite_1.npz")
+    assert len(saved["sequence"]) == 2
+    assert np.isnan(saved["recorded"][0, 0]).all()
+    assert np.isfinite(saved["features"]).all()
+
+
+def test_samples_end_where_the_recording_does(loaded, network):
+    """The last step of a sample would lie after the last recorded frame."""
+    builder = UnrolledBuilder(loaded, network, QUIET, PLAIN, 3, 0)
+    last = len(loaded[0].vertices) - 1
+    assert [builder.reaches(0, t) for t in (last - 4, last - 3, last - 2)] == [True, True, False]
+    batch = builder.build([(0, last - 3)], 999, np.random.default_rng(0))
+    np.testing.assert_array_equal(batch.recorded[-1].numpy(), np.array(loaded[0].source.vertices[last]))
+
+
+def test_settings_that_do_not_go_together_are_refused(data, tmp_path):
+    """A run would silently train otherwise than asked."""
+    with pytest.raises(ValueError, match="between 1 and"):
+        UnrollConfig(steps=0)
+    with pytest.raises(ValueError, match="must not be negative"):
+        UnrollConfig(position=-1.0)
+    with pytest.raises(ValueError, match="leave out compile"):
+        config_for(data, tmp_path, unroll=UnrollConfig(steps=2), compile=True)
+    with pytest.raises(ValueError, match=r"augmentation\.scale"):
+        config_for(data, tmp_path, unroll=UnrollConfig(steps=2), augmentation=Augmentation(scale=0.05))
