@@ -21,7 +21,7 @@ import os, signal, sys
 from pathlib import Path
 from support.runs import SETTINGS
 from support.runs import config_for
-from warpgarment.training import train
+from warpgarment.training.train import start as train
 data, out, first = Path(sys.argv[1]), Path(sys.argv[2]), os.environ["TORCHELASTIC_RESTART_COUNT"] == "0"
 assert first != (out / "state.safetensors").exists()
 update = train.Run.update

@@ -25,7 +25,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from support.runs import config_for
-from warpgarment.training import train
+from warpgarment.training.train import start as train
 update = train.Run.update
 train.Run.update = lambda run, batch: os.kill(os.getpid(), signal.SIGKILL) if run.step == 6 else update(run, batch)
 train.train(config_for(Path(sys.argv[1]), Path(sys.argv[2])))
