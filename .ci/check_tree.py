@@ -31,7 +31,7 @@ WARP = ("kernel", "func", "func_grad", "func_replay", "func_native")  # wp.kerne
 WAITING_FOLDERS = {"kernels": 33, "warpgarment": 44, "training": 66, "tests": 90}
 WAITING_LINES = {"tests/test_simulator.py": 473}
 WAITING_BORROWERS = 12
-WAITING_TYPES = 97
+WAITING_TYPES = 85
 
 
 def link(root: Path) -> Path:
