@@ -31,7 +31,6 @@ WARP = ("kernel", "func", "func_grad", "func_replay", "func_native")  # wp.kerne
 WAITING_FOLDERS = {"kernels": 33, "warpgarment": 44, "training": 66, "tests": 90}
 WAITING_LINES = {"tests/test_simulator.py": 473}
 WAITING_BORROWERS = 12
-WAITING_TYPES = 85
 
 
 def link(root: Path) -> Path:
@@ -140,7 +139,7 @@ def _python(root: Path, *folders: str) -> Iterator[Path]:
 
 
 CHECKS = (  # what is checked, how many faults are still allowed, what to do
-    (type_errors, WAITING_TYPES, "mend the types: an annotation, a narrowing, a small protocol"),
+    (type_errors, 0, "mend the types: an annotation, a narrowing, a small protocol"),
     (wrong_imports, 0, "move what is shared to a lower room, or the import to where it is allowed"),
     (wrong_packages, 0, "change `packages` of [tool.setuptools] in pyproject.toml"),
     (crowded_folders, 0, "give what belongs together a folder of its own"),

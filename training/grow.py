@@ -18,6 +18,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from typing import cast
 
 import torch
 from torch import nn
@@ -104,14 +105,15 @@ def _fill(large: ManifoldAwareTransformer, small: ManifoldAwareTransformer) -> N
         into.weight.copy_(_shared(source.weight, copies))
         into.bias.copy_(source.bias)
     before, after = small.config.layers, large.config.layers
-    places = {round(i * after / before): layer for i, layer in enumerate(small.layers)}
-    for place, layer in enumerate(large.layers):
+    given, made = (cast(list[EncoderLayer], list(network.layers)) for network in (small, large))  # typed as modules
+    places = {round(i * after / before): layer for i, layer in enumerate(given)}
+    for place, layer in enumerate(made):
         if place in places:
             _layer(layer, places[place], small.config, large.config)
         else:
-            for writes in (layer.attention.out, layer.contract):
-                nn.init.zeros_(writes.weight)
-                nn.init.zeros_(writes.bias)
+            for last in (layer.attention.out, layer.contract):
+                nn.init.zeros_(last.weight)
+                nn.init.zeros_(last.bias)
 
 
 def _layer(into: EncoderLayer, source: EncoderLayer, old: NetworkConfig, new: NetworkConfig) -> None:

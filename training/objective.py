@@ -8,6 +8,8 @@ weights, of which autocast makes copies.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
@@ -90,7 +92,8 @@ class Trainer:
     """
 
     def __init__(self, objective: Objective | UnrolledObjective, group: Group, compile: bool) -> None:
-        self.compiled, self._worked, self._inputs = compile, False, objective.inputs
+        self.compiled, self._worked = compile, False
+        self._inputs: Callable[..., tuple] = objective.inputs  # of the batches that go with the objective
         if compile:
             objective.compile(dynamic=True)  # the number of faces changes from batch to batch
         self._model: nn.Module = objective

@@ -15,6 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from warpgarment.errors import CheckpointError
+from warpgarment.garment_network import GarmentNetwork
 from warpgarment.io.atomic import atomic_file
 
 
@@ -26,7 +27,7 @@ class Average:
         decay: Of the average; less at first, (1 + n) / (10 + n) after n updates.
     """
 
-    def __init__(self, network: torch.nn.Module, decay: float) -> None:
+    def __init__(self, network: GarmentNetwork, decay: float) -> None:
         self.network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay, self.updates = decay, 0
 

@@ -18,14 +18,14 @@ from warpgarment.heading import rotation_about_up
 from warpgarment.history import History
 from warpgarment.kernels.deformation import face_centroids, segment_mean
 from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
-from warpgarment.network import ManifoldAwareTransformer
+from warpgarment.network import GarmentNetwork
 from warpgarment.scene import Scene
 from warpgarment.timing import Timings
 from warpgarment.training.augmentation import Augmentation
 from warpgarment.training.flops import work
 from warpgarment.training.interactions import COLUMNS, unpack
 from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.samples import SampleBuilder
+from warpgarment.training.samples import HistoryBuilder
 from warpgarment.training.sequence_data import SequenceData
 
 _VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
@@ -82,7 +82,7 @@ def turned(
     return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
 
 
-class UnrolledBuilder(SampleBuilder):
+class UnrolledBuilder(HistoryBuilder):
     """Builds batches for unrolled training; takes the place of `SampleBuilder` in a loader.
 
     Args:
@@ -97,7 +97,7 @@ class UnrolledBuilder(SampleBuilder):
     def __init__(
         self,
         sequences: list[SequenceData],
-        network: ManifoldAwareTransformer,
+        network: GarmentNetwork,
         noise: NoiseConfig,
         augmentation: Augmentation,
         steps: int,
