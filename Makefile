@@ -1,6 +1,6 @@
 # make demo    installs the package in .venv and rolls out the bundled garments (out/demo/)
 # make test    installs what the tests need and runs them
-# make lint    ruff and mypy
+# make lint    ruff, and .ci/check_tree.py: types, directions of imports, folders, files
 # make bench   times a rollout by stage on this machine
 # make gpu     on a machine with a GPU: what it computes beside a CPU, then all benchmarks
 #
@@ -29,7 +29,8 @@ test: $(VENV)/.test
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
-	$(BIN)/mypy
+	$(BIN)/ruff format --check .
+	$(BIN)/python .ci/check_tree.py
 
 bench: $(VENV)/.demo
 	$(BIN)/warpgarment bench $(if $(DEVICE),--device $(DEVICE))

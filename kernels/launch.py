@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import torch
 import warp as wp
@@ -54,7 +54,7 @@ def expect(
 def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A Warp array over the tensor's memory; no copy where the tensor is contiguous, and no gradient buffer."""
     wp.init()
-    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+    return cast(wp.array, wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False))
 
 
 def as_argument(tensor: torch.Tensor, dtype: type) -> object:

@@ -166,7 +166,7 @@ class CollisionSolver:
         expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
         if body_of_vertex is not None:
             expect("body_of_vertex", body_of_vertex, (self.vertex_count,), torch.int32, self.device)
-        each = isinstance(epsilon, torch.Tensor)
+        reach, kept = (math.inf, 0.0) if isinstance(epsilon, torch.Tensor) else (epsilon, epsilon)
         if isinstance(epsilon, torch.Tensor):
             expect("epsilon", epsilon, (self.vertex_count,), device=self.device)
         elif not epsilon >= 0:
@@ -185,7 +185,7 @@ class CollisionSolver:
                 query.distance,
                 query.face,
                 bodies,
-                math.inf if each else epsilon,
+                reach,
                 body_of_vertex=body_of_vertex,
                 origin=origin,
             )
@@ -195,7 +195,7 @@ class CollisionSolver:
             if number == 0:
                 self._contacts = torch.count_nonzero((normal != 0).any(dim=1))
             vertices, report, error = torch.ops.warpgarment.collision_solve(
-                vertices, normal, closest, 0.0 if each else epsilon, limit, self._model, self.max_iterations
+                vertices, normal, closest, kept, limit, self._model, self.max_iterations
             )
             self._progress.record(report, error, self.max_iterations, add=number > 0)
         return vertices

@@ -116,7 +116,7 @@ class Factor(NamedTuple):
         host = (base, ends[:-1].astype(np.int32), order.astype(np.int32), pivot.astype(np.float64), triangle)
         counts = torch.tensor([int((base >= 0).sum()), int((base < 0).sum()), int(explicit), int(ends[-1])])
         arrays = (*host, *triangles[0], *triangles[1])
-        return cls(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays), counts)
+        return cls._make((*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays), counts))
 
     def without(self, load: torch.Tensor, vertex_component: torch.Tensor) -> torch.Tensor:
         """A load [V,3] with zeros on the components that have a factor."""
@@ -193,8 +193,10 @@ def _inverted(
     """W = L⁻¹ without its diagonal, by columns; None where its two copies don't fit in the budget."""
     count = matrix.shape[0]
     parent, depth = np.full(count, -1, np.int32), np.zeros(count, np.int32)
-    arrays = [wp.array(a.astype(np.int32), device="cpu") for a in (matrix.indptr, matrix.indices, parent)]
-    tree = [wp.array(a, device="cpu") for a in (parent, depth)]
+    arrays: list[wp.array] = [
+        wp.array(a.astype(np.int32), device="cpu") for a in (matrix.indptr, matrix.indices, parent)
+    ]
+    tree: list[wp.array] = [wp.array(a, device="cpu") for a in (parent, depth)]
     wp.launch(elimination_tree, dim=1, inputs=[*arrays, *tree], device="cpu")
     parent, depth = (a.numpy() for a in tree)
     pointer = np.concatenate([[0], np.cumsum(depth.astype(np.int64))])
@@ -202,10 +204,10 @@ def _inverted(
         return None
     where = wp.device_from_torch(device)
     host = (lower.indptr, lower.indices, parent, depth, pointer)
-    integers = [wp.array(a.astype(np.int32), device=where) for a in host]
+    integers: list[wp.array] = [wp.array(a.astype(np.int32), device=where) for a in host]
     column = wp.empty(int(pointer[-1]), dtype=wp.int32, device=where)
     value = wp.zeros(int(pointer[-1]), dtype=wp.float64, device=where)
-    data = wp.array(lower.data, dtype=wp.float64, device=where)
+    data: wp.array[wp.float64] = wp.array(lower.data, dtype=wp.float64, device=where)
     wp.launch(invert_columns, dim=count, inputs=[*integers, data, column, value], device=where)
     return scipy.sparse.csc_matrix((value.numpy(), column.numpy(), pointer), shape=(count, count))
 

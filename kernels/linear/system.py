@@ -29,7 +29,9 @@ class System(NamedTuple):
     diagonal: torch.Tensor
 
     @classmethod
-    def build(cls, matrix: scipy.sparse.csr_matrix, vertex_component: np.ndarray, count: int, device: object) -> System:
+    def build(
+        cls, matrix: scipy.sparse.csr_matrix, vertex_component: np.ndarray, count: int, device: torch.device
+    ) -> System:
         """Moves a host matrix [V,V] to the device. No entry may join two components."""
         matrix = matrix.tocsr()
         rows = np.argsort(vertex_component, kind="stable").astype(np.int32)

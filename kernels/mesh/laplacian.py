@@ -16,6 +16,8 @@ and its null space holds one constant per connected component.
 
 from __future__ import annotations
 
+from collections.abc import Sized
+
 import numpy as np
 import scipy.sparse
 import torch
@@ -64,7 +66,7 @@ def half_cotangents(rest_vertices: object, faces: object) -> np.ndarray:
     return dots / (2.0 * double_area[:, None])
 
 
-def cotangent_laplacian(rest_vertices: object, faces: object) -> scipy.sparse.csr_matrix:
+def cotangent_laplacian(rest_vertices: Sized, faces: object) -> scipy.sparse.csr_matrix:
     """The positive semi-definite cotangent Laplacian, weights ½ (cot α + cot β).
 
     Args:

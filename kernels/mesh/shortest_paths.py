@@ -235,7 +235,7 @@ class Paths:
         self.place = np.empty(self.count, np.int32)  # new number of each node
         self.place[order] = np.arange(self.count, dtype=np.int32)
         graph = graph[order][:, order]
-        self._model = [
+        self._model: list[wp.array] = [
             wp.array(graph.indptr, dtype=wp.int32, device="cpu"),
             wp.array(graph.indices, dtype=wp.int32, device="cpu"),
             wp.array(np.rint(graph.data / self.unit).astype(np.int64), dtype=wp.int64, device="cpu"),
@@ -306,7 +306,8 @@ def neighbourhoods(points: np.ndarray, size: int) -> Iterator[np.ndarray]:
 def _landmarks(graph: csr_matrix) -> np.ndarray:
     """Distances to some nodes far from each other, [N,LANDMARKS]: places of nodes as the graph alone knows them."""
     away = dijkstra(graph, indices=0)
-    nearest, found = np.full(graph.shape[0], np.inf), []
+    found: list[np.ndarray] = []
+    nearest = np.full(graph.shape[0], np.inf)
     for _ in range(LANDMARKS):
         away = dijkstra(graph, indices=int(away.argmax() if not found else nearest.argmax()))
         nearest = np.minimum(nearest, away)

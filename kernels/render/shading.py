@@ -222,9 +222,9 @@ def render(
     Returns:
         NumPy uint8 [height / samples, width / samples, 3].
     """
-    v = wp.array(vertices, dtype=wp.vec3, device=device)
-    c = wp.array(colors, dtype=wp.vec3, device=device)
-    f = wp.array(faces, dtype=wp.int32, device=device)
+    v: wp.array[wp.vec3] = wp.array(vertices, dtype=wp.vec3, device=device)
+    c: wp.array[wp.vec3] = wp.array(colors, dtype=wp.vec3, device=device)
+    f: wp.array[wp.int32] = wp.array(faces, dtype=wp.int32, device=device)
     normals = wp.zeros(len(vertices), dtype=wp.vec3, device=device)
     wp.launch(vertex_normal_kernel, dim=len(faces), inputs=[v, f], outputs=[normals], device=device)
     screen, buffer = rasterise(view, v, f, device)

@@ -17,6 +17,7 @@ import numpy as np
 
 from warpgarment.errors import MissingExtra
 from warpgarment.io.cache import cache_folder
+from warpgarment.io.npz import write_npz
 from warpgarment.training.meshes.cutting import averaging, boundary_loops, compacted, without_short_edges
 
 TEMPLATE_FACES = 6000
@@ -189,10 +190,7 @@ def anny_bodies() -> AnnyBodies:
     """Anny on the light template; the first call on a machine builds the cache (about two minutes)."""
     cache = cache_folder() / f"anny_template_{TEMPLATE_FACES}_v{_CACHE_VERSION}.npz"
     if not cache.exists():
-        cache.parent.mkdir(parents=True, exist_ok=True)
-        partial = cache.with_name(f"{cache.stem}.{os.getpid()}.npz")
-        np.savez(partial, **_build_template())
-        partial.replace(cache)
+        write_npz(cache, _build_template())
     return AnnyBodies(cache)
 
 

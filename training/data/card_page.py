@@ -75,7 +75,9 @@ def _made(facts: Facts) -> list[str]:
         lines += ["", f"    {common.get('command') or _command(common)}", ""]
     elif seeds and len(seeds) == 1:
         lines += [f"Seed {seeds.pop()}. Every manifest holds the parameters of its sequence.", ""]
-    versions = common.get("versions") or next((m["versions"] for m in manifests if m.get("versions")), {})
+    versions: Mapping[str, Any] = common.get("versions") or next(
+        (m["versions"] for m in manifests if m.get("versions")), {}
+    )
     if versions:
         lines += ["Versions: " + ", ".join(f"{k} {v}" for k, v in versions.items() if v) + ".", ""]
     settings = {k: v for k, v in teacher.items() if not isinstance(v, (dict, list))}

@@ -106,9 +106,8 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         from warpgarment.training.tables import make_table
 
         return make_table(config)
-    for name in ("data", "out"):
-        if getattr(config, name) is None:
-            raise OptionMissing(f"an evaluation needs --{name} FOLDER")
+    if config.data is None or config.out is None:
+        raise OptionMissing(f"an evaluation needs --{'data' if config.data is None else 'out'} FOLDER")
     path = checkpoint.find(config.network, device=config.device)
     simulator = Simulator(checkpoint.load(path), config.device)
     skipped: dict[str, str] = {}

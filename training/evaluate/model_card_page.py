@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.data.card_page import counts, credits, table
 from warpgarment.training.tables.protocol import FIGURES, METHODS, STARTS
 
@@ -25,7 +25,7 @@ _STARTS = {"warm": "from the recorded frames a network remembers", "cold": "from
 
 def page(
     name: str,
-    network: ManifoldAwareTransformer,
+    network: GarmentNetwork,
     notes: Mapping[str, Any],
     evaluation: Mapping[str, Any],
     facts: Facts,

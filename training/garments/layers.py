@@ -75,7 +75,7 @@ class Sheet:
         on_border = np.zeros(self.faces.max() + 1, bool)
         on_border[self.edges[uses == 1]] = True
         self._border_corner = on_border[self.faces]
-        self._triangles = wp.array(self.faces.astype(np.int32), dtype=int, device="cpu")
+        self._triangles: wp.array = wp.array(self.faces.astype(np.int32), dtype=int, device="cpu")
         self._mesh: wp.Mesh | None = None
 
     def locate(self, vertices: np.ndarray, points: np.ndarray) -> Located:
@@ -127,7 +127,7 @@ class Sheet:
             self._mesh.points.assign(placed)
             self._mesh.refit()
         count = wp.zeros(len(triangles), dtype=int, device="cpu")
-        moved = wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device="cpu")
+        moved: wp.array[wp.vec3] = wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device="cpu")
         inputs = [self._mesh.id, moved, triangles, same]
         wp.launch(_count_crossings, dim=len(triangles), inputs=inputs, outputs=[count], device="cpu")
         return count.numpy()

@@ -177,8 +177,8 @@ def _path(vertices: np.ndarray, faces: np.ndarray, cut: Seam) -> list[int]:
     if not len(inside):
         return []
     if cut.low <= 0:
-        start = np.flatnonzero(border)
-        start = int(start[np.linalg.norm(vertices[start] - line[0], axis=1).argmin()])
+        rim = np.flatnonzero(border)
+        start = int(rim[np.linalg.norm(vertices[rim] - line[0], axis=1).argmin()])
     else:
         start = int(inside[np.linalg.norm(vertices[inside] - line[0], axis=1).argmin()])
     end = int(inside[np.linalg.norm(vertices[inside] - line[-1], axis=1).argmin()])

@@ -86,6 +86,8 @@ def body_motion(plan: Plan, config: GenerateConfig) -> tuple[RestBody, np.ndarra
 def _poses(plan: Plan, config: GenerateConfig, body: RestBody) -> PoseSequence:
     if plan.motion.startswith("procedural:"):
         return procedural(body, plan.motion.split(":")[1], plan.frames, seed=plan.number, fps=FPS)
+    if config.motions is None:
+        raise UnusableMotion(f"{plan.motion} is a clip, and no folder of clips was given")
     path = next(p for p in list_clips(Path(config.motions)) if p.stem == plan.motion)
     poses = retarget(read_clip(path), body, FPS)
     lead = 8 if len(poses) > plan.frames + 8 else min(2, len(poses) - 2)  # the first frames are often a T-pose
@@ -99,7 +101,7 @@ def clothed(plan: Plan, body: RestBody, transforms: np.ndarray) -> tuple[tuple[G
     The rest pose stands at the origin; the motion starts in the same pose elsewhere, a rigid move away.
     """
     if len(plan.outfit.layers) == 1:
-        made = (make_garment(body, plan.outfit.layers[0], plan.outfit.gaps[0]),)
+        made: tuple[tuple[Garment, float], ...] = (make_garment(body, plan.outfit.layers[0], plan.outfit.gaps[0]),)
     else:
         made = make_outfit(body, plan.outfit)
     if plan.seams:

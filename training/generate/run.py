@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -95,14 +96,18 @@ def simulate(attempts: list[Attempt], teacher: Teacher) -> None:
     live = [a for a in attempts if a.reason is None]
     if not live:
         return
+    scenes = [a.scene for a in live if a.scene is not None]  # all: one that could not be prepared has a reason
+    stream: Iterator[Sequence[np.ndarray | None]]
     if len(live) == 1:
-        stream = ([vertices] for vertices in teacher.simulate(live[0].scene))
+        stream = ([vertices] for vertices in teacher.simulate(scenes[0]))
     else:
-        stream = teacher.simulate_many([a.scene for a in live])
+        stream = teacher.simulate_many(scenes)
     for frame, worlds in enumerate(stream):
         for attempt, vertices in zip(live, worlds, strict=True):
             if vertices is None or attempt.reason:
                 continue
+            assert attempt.gate is not None  # made with the scene, as the frames are
+            assert attempt.body_frames is not None
             attempt.reason = attempt.gate.check(frame, vertices, attempt.body_frames[frame])
             if not attempt.reason:
                 attempt.frames.append(vertices)

@@ -47,7 +47,7 @@ class Wind:
     gusts: float = 0.0
     turn: float = 0.0
     period: float = 3.0
-    phases: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    phases: tuple[float, ...] = (0.0,) * 6
 
     def __post_init__(self) -> None:
         length = math.hypot(*self.direction)

@@ -45,7 +45,8 @@ def spread(function: Callable[[Any], Any], items: Iterable[Any], processes: int)
                     connection.close()
                     continue
                 busy[connection] = process, waiting.pop()
-            for connection in wait(list(busy)):
+            ready = wait(list(busy))
+            for connection in [c for c in busy if c in ready]:
                 process, item = busy.pop(connection)
                 try:
                     done = Done(item, *connection.recv())
@@ -78,7 +79,7 @@ def _work(function: Callable[[Any], Any], connection: Connection) -> None:
         except EOFError:
             return
         try:
-            answer = (function(item), None)
+            answer: tuple[Any, str | None] = (function(item), None)
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
             answer = (None, f"{type(error).__name__}: {error} ({last.name}, line {last.lineno})")

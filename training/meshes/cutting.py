@@ -180,15 +180,15 @@ def remeshed(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
     area = 0.5 * np.asarray(igl.doublearea(vertices, faces.astype(np.int64))).sum()
     edge = float(np.sqrt(area * 4.0 / (np.sqrt(3.0) * target_faces)))
     aimed = edge
-    best: tuple[np.ndarray, np.ndarray] | None = None
+    best, least = (vertices, faces), np.inf
     for _ in range(4):
         points, triangles = evened_boundary(vertices.astype(float), faces, aimed)
         for rounds, shortest in ((12, 0.45), (4, 0.4)):
             points, triangles = remesh_botsch(points, triangles.astype(np.int32), i=rounds, h=aimed, project=True)
             points, triangles = without_short_edges(points, triangles, shortest * aimed)
         points, triangles = without_flat_ears(points, triangles)
-        if best is None or abs(len(triangles) - target_faces) < abs(len(best[1]) - target_faces):
-            best = points, triangles
+        if abs(len(triangles) - target_faces) < least:
+            best, least = (points, triangles), abs(len(triangles) - target_faces)
         ratio = len(triangles) / target_faces
         if abs(ratio - 1) < _TOLERANCE:
             break

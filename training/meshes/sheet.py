@@ -10,7 +10,7 @@ class EditableSheet:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         self.points = np.array(vertices, dtype=np.float64)
-        self._faces: list[list[int] | None] = faces.tolist()
+        self._faces: list[list[int]] = faces.tolist()  # empty where a face is gone
         self._around: list[set[int]] = [set() for _ in range(len(vertices))]
         for f, face in enumerate(self._faces):
             for v in face:
@@ -40,7 +40,7 @@ class EditableSheet:
         for f in shared:
             for v in self._faces[f]:
                 self._around[v].discard(f)
-            self._faces[f] = None
+            self._faces[f] = []
         for f in self._around[gone]:
             self._faces[f] = [kept if v == gone else v for v in self._faces[f]]
             self._around[kept].add(f)
@@ -65,6 +65,6 @@ class EditableSheet:
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices [V, 3] and faces [F, 3] that are left, vertices in their old order."""
-        faces = np.array([f for f in self._faces if f is not None], dtype=np.int64)
+        faces = np.array([f for f in self._faces if f], dtype=np.int64)
         used, renumbered = np.unique(faces, return_inverse=True)
         return self.points[used], renumbered.reshape(-1, 3)

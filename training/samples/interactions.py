@@ -34,7 +34,12 @@ from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
 WIDTH = 16
-COLUMNS = {"closest": slice(0, 3), "sign": 3, "deformation": slice(4, 13), "velocity": slice(13, 16)}
+COLUMNS: dict[str, int | slice] = {
+    "closest": slice(0, 3),
+    "sign": 3,
+    "deformation": slice(4, 13),
+    "velocity": slice(13, 16),
+}
 _SOURCES = (
     "garment_rest_vertices", "garment_faces", "garment_vertices", "body_rest_vertices", "body_faces", "collider_faces",
     "bone_indices", "bone_weights", "bone_transforms",

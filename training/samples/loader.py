@@ -9,12 +9,35 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Iterator
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
 
 from .pushforward import Pool
-from .single_step import Batch, SampleBuilder
+from .single_step import Batch
+
+Built = TypeVar("Built", covariant=True)
+
+
+class Builder(Protocol[Built]):
+    """What builds the batches of a loader: `SampleBuilder`, or `UnrolledBuilder` for several steps in a row."""
+
+    device: torch.device
+    patches: bool
+
+    def reaches(self, sequence: int, newest: int) -> bool:
+        """Whether the recorded frames that a sample needs follow a frame."""
+
+    def build(
+        self,
+        picks: list[tuple[int, int]],
+        faces: int | None,
+        rng: np.random.Generator,
+        displacements: list[np.ndarray | None] | None = None,
+        part: slice = slice(None),
+    ) -> Built:
+        """See `SampleBuilder.build`."""
 
 
 class Plan:
@@ -49,7 +72,7 @@ class Plan:
         return [(int(s), int(t)) for s, t in self._order[step % self.batches]]
 
 
-class Loader:
+class Loader(Generic[Built]):
     """Builds the batches of steps, in a thread of its own, `depth` ahead.
 
     Args:
@@ -65,7 +88,7 @@ class Loader:
 
     def __init__(
         self,
-        builder: SampleBuilder,
+        builder: Builder[Built],
         plan: Plan,
         pool: Pool,
         share: float,
@@ -78,7 +101,7 @@ class Loader:
         # A stream of its own: what a batch waits for is not the training step, nor the other way round
         self._stream = torch.cuda.Stream(builder.device) if builder.device.type == "cuda" else None
 
-    def build(self, step: int, *, splits: int | None = None, part: slice | None = None) -> Batch:
+    def build(self, step: int, *, splits: int | None = None, part: slice | None = None) -> Built:
         """The batch of a step; `splits` and `part` override the schedule's and the process's."""
         rng = np.random.default_rng((self.plan.seed, 1, step))
         picks = self.plan.picks(step)
@@ -101,7 +124,7 @@ class Loader:
         """Whether enough recorded frames follow a frame of the pool."""
         return self.builder.reaches(*self.pool.entry(rollout, last)[:2])
 
-    def batches(self, start: int, stop: int) -> Iterator[Batch]:
+    def batches(self, start: int, stop: int) -> Iterator[Built]:
         """The batches of steps start..stop-1, in order."""
         if self.depth == 0:
             yield from map(self.build, range(start, stop))
@@ -111,7 +134,7 @@ class Loader:
         ready: queue.Queue = queue.Queue(maxsize=self.depth)
         stopped = threading.Event()
 
-        def hand_over(item: tuple[Batch, torch.cuda.Event | None] | BaseException) -> bool:
+        def hand_over(item: tuple[Built, torch.cuda.Event | None] | BaseException) -> bool:
             while not stopped.is_set():
                 try:
                     ready.put(item, timeout=0.2)

@@ -49,7 +49,8 @@ class SequenceData:
         self.faces = torch.as_tensor(np.array(garment.faces, np.int32), device=device)
         self.rest = torch.as_tensor(np.array(garment.vertices, np.float32), device=device)
         self.inverse_rest = inverse_rest_frames(self.rest, self.faces)
-        self._geodesics, self._network, self._kernel = geodesics, network, None
+        self._geodesics, self._network = geodesics, network
+        self._kernel: torch.Tensor | None = None
 
         vertex_component, self.components = _components(len(self.rest), garment.faces)
         self.face_component = torch.as_tensor(vertex_component[garment.faces[:, 0]], dtype=torch.int64, device=device)
@@ -132,7 +133,7 @@ class SequenceData:
 
 def _writable(array: np.ndarray) -> np.ndarray:
     """The same memory map, copy-on-write, so that torch takes it without a warning; nothing is read yet."""
-    if isinstance(array, np.memmap):
+    if isinstance(array, np.memmap) and array.filename is not None:
         return np.load(array.filename, mmap_mode="c")
     return array
 

@@ -27,7 +27,7 @@ from warpgarment.kernels.deformation.gradients import deformation_gradient_from_
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.flops import step_flops
+from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
 from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.nn.patches.layout import Patches, PatchLayout, patch_layout
@@ -57,8 +57,7 @@ class Batch(NamedTuple):
     def work(self, config: NetworkConfig) -> tuple[int, int]:
         """Samples, and operations of a training step on them (`flops.py`)."""
         samples, faces = self.features.shape[:2]
-        patches = self.weights.start.shape[1] if isinstance(self.weights, PatchLayout) else 0
-        return samples, step_flops(config, samples, faces, self.velocities.shape[1], patches)
+        return samples, work(config, [(samples, faces, self.velocities.shape[1], self.weights)])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is kept of a batch whose loss is not finite."""
@@ -67,8 +66,8 @@ class Batch(NamedTuple):
         return {name: tensor.cpu().numpy() for name, tensor in (tensors | self.target._asdict()).items()}
 
 
-class SampleBuilder:
-    """Builds batches.
+class HistoryBuilder:
+    """What the builders of batches have in common: their settings, and how a history is displaced.
 
     Args:
         sequences: Training sequences.
@@ -77,7 +76,9 @@ class SampleBuilder:
         augmentation: Mirror, turns and sizes.
     """
 
-    def __init__(self, sequences: list[SequenceData], network, noise: NoiseConfig, augmentation: Augmentation) -> None:
+    def __init__(
+        self, sequences: list[SequenceData], network: NetworkConfig, noise: NoiseConfig, augmentation: Augmentation
+    ) -> None:
         self.sequences, self.network = sequences, network
         self.noise, self.augmentation = noise, augmentation
         self.device = sequences[0].device
@@ -86,6 +87,28 @@ class SampleBuilder:
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the recorded frames that a sample needs follow a frame."""
         return newest < self.sequences[sequence].count
+
+    def displacement(
+        self, sequence: SequenceData, rng: np.random.Generator, override: np.ndarray | None
+    ) -> np.ndarray | None:
+        """[history,V,3]: noise plus the override of the newest frames; None where there is neither."""
+        delta = sequence.noise.displacement(self.network.history, self.noise, rng)
+        if override is not None:
+            if delta is None:
+                delta = np.zeros((self.network.history, *override.shape[1:]), np.float32)
+            delta[-len(override) :] += override
+        return delta
+
+
+class SampleBuilder(HistoryBuilder):
+    """Builds batches.
+
+    Args:
+        sequences: Training sequences.
+        network: Their `NetworkConfig`.
+        noise: Perturbation of histories.
+        augmentation: Mirror, turns and sizes.
+    """
 
     @torch.no_grad()
     def build(
@@ -140,7 +163,7 @@ class SampleBuilder:
                 shown.append(sequence.patches if whole_garments else sequence.patches.subset(subset))
             if weights is not None:
                 weights[b] = sequence.weights(subset, scale[b])
-            subset = self._send(subset)
+            seen = self._send(subset)
             frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
             past = sequence.vertices[frames]
             delta = self.displacement(sequence, rng, displacements[b])
@@ -155,13 +178,13 @@ class SampleBuilder:
             velocities[b, : sequence.components] = (centres[1:] - centres[:-1]).transpose(0, 1).flatten(1)
             velocity[b, : sequence.components] = sequence.component_weights @ after - centres[-1]
             body_velocity[b, : sequence.components] = sequence.body_velocity[t] @ similarity[b].mT
-            rows[b] = sequence.interaction[frames[None, :], subset[:, None]]
+            rows[b] = sequence.interaction[frames[None, :], seen[:, None]]
             early = max(history - 1 - t, 0)
             if early:
                 rows[b, :, :early, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
                 rows[b, :, :early, COLUMNS["velocity"]] = 0.0
-            inverse_rest[b] = sequence.inverse_rest[subset]
-            chosen, vertices = sequence.faces[subset], past.shape[1]
+            inverse_rest[b] = sequence.inverse_rest[seen]
+            chosen, vertices = sequence.faces[seen], past.shape[1]
             steps = torch.arange(history, dtype=torch.int32, device=device) * vertices + start
             corners.append(chosen[:, None, :] + steps[None, :, None])
             next_corners.append(chosen + next_start)
@@ -238,17 +261,6 @@ class SampleBuilder:
         if self.device.type != "cuda":
             return values.to(self.device)
         return values.pin_memory().to(self.device, non_blocking=True)
-
-    def displacement(
-        self, sequence: SequenceData, rng: np.random.Generator, override: np.ndarray | None
-    ) -> np.ndarray | None:
-        """[history,V,3]: noise plus the override of the newest frames; None where there is neither."""
-        delta = sequence.noise.displacement(self.network.history, self.noise, rng)
-        if override is not None:
-            if delta is None:
-                delta = np.zeros((self.network.history, *override.shape[1:]), np.float32)
-            delta[-len(override) :] += override
-        return delta
 
     @staticmethod
     def _turn(rows: torch.Tensor, turn: torch.Tensor, similarity: torch.Tensor, origin: torch.Tensor) -> None:

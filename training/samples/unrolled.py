@@ -15,9 +15,9 @@ import torch
 from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
 from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.nn.flops import step_flops
+from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
+from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.pack import PackedBodies
 from warpgarment.sim.history import History
 from warpgarment.sim.scene import Scene
@@ -27,7 +27,7 @@ from .augmentation import Augmentation
 from .interactions import COLUMNS, unpack
 from .noise import NoiseConfig
 from .recorded import SequenceData
-from .single_step import SampleBuilder
+from .single_step import HistoryBuilder
 
 _VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
 
@@ -52,8 +52,8 @@ class UnrolledBatch:
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
         """Samples, and operations of a training step on them (`flops.py`)."""
-        each = [step_flops(config, *view.face_index.shape, view.component_index.shape[1]) for view in self.scene.views]
-        return len(self.ids), len(self.recorded) * sum(each)
+        views = [(*view.face_index.shape, view.component_index.shape[1], view.weights) for view in self.scene.views]
+        return len(self.ids), len(self.recorded) * work(config, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is kept of a batch whose loss is not finite."""
@@ -83,7 +83,7 @@ def turned(
     return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
 
 
-class UnrolledBuilder(SampleBuilder):
+class UnrolledBuilder(HistoryBuilder):
     """Builds batches for unrolled training; takes the place of `SampleBuilder` in a loader.
 
     Args:
@@ -98,7 +98,7 @@ class UnrolledBuilder(SampleBuilder):
     def __init__(
         self,
         sequences: list[SequenceData],
-        network: ManifoldAwareTransformer,
+        network: GarmentNetwork,
         noise: NoiseConfig,
         augmentation: Augmentation,
         steps: int,

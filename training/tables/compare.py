@@ -50,7 +50,8 @@ def make(config: Any) -> dict[str, Any]:
         raise DataLacks(
             f"{root}: no {config.split} sequences{unread}. `warpgarment generate --out DIR` makes a set with some"
         )
-    data, rows = identity(root), []
+    data = identity(root)
+    rows: list[dict[str, Any]] = []
     runs, diverged = {}, dict[str, str]()
     for variant in chosen:
         folder = Path(config.tables.runs) / config.table / variant.name

@@ -35,7 +35,7 @@ def make(config: Any) -> dict[str, Any]:
     rows = [timed(simulator, faces, frames) for faces in config.tables.faces]
     stages = [s for s in (*STAGES, "rest") if any(row["ms"].get(s) for row in rows)]
     stages[-1:-1] = sorted({s for row in rows for s in row["ms"]} - {*stages, "rest"})
-    result = {"table": "figure5", "title": "Figure 5: time by stage", "protocol": NOTE}
+    result: dict[str, Any] = {"table": "figure5", "title": "Figure 5: time by stage", "protocol": NOTE}
     result |= {"network": path.name, "frames": frames, "rows": rows}
     lines = [[f"{r['faces']:,}", *(f"{r['ms'].get(s, 0.0):.1f}" for s in stages)] for r in rows]
     lines = [[*line, f"{row['frame_ms']:.1f}", f"{row['setup_s']:.2f}"] for line, row in zip(lines, rows, strict=True)]

@@ -74,8 +74,8 @@ def make(config: Any) -> dict[str, Any]:
             "`warpgarment generate --out DIR` makes a set with some"
         )
     summary = summarised(rows)
-    result = {"table": "figure7", "title": "Figure 7: one garment at several resolutions", "protocol": NOTE}
-    result |= {"network": path.name, "rows": summary, "sequences": rows, "skipped": skipped}
+    result: dict[str, Any] = {"table": "figure7", "title": "Figure 7: one garment at several resolutions"}
+    result |= {"protocol": NOTE, "network": path.name, "rows": summary, "sequences": rows, "skipped": skipped}
     headings = ["resolution", "start", "faces", "from the reference [mm]", "at the start [mm]"]
     headings += ["from the recording [mm]", "failed"]
     lines = [

@@ -57,7 +57,8 @@ def make(config: Any) -> dict[str, Any]:
     title, find, note = TABLES[config.table]
     skipped: dict[str, str] = {}
     groups = find(Path(config.data), config, skipped)
-    rows, left_out, keeper = [], dict[str, str](), Keeper({group.folders[0].name for group in groups})
+    rows: list[dict[str, Any]] = []
+    left_out, keeper = dict[str, str](), Keeper({group.folders[0].name for group in groups})
     for place in (config.network, *config.tables.against):
         path = checkpoint.find(place, device=config.device)
         simulator = Simulator(checkpoint.load(path), config.device)

@@ -72,7 +72,7 @@ def make(config: Any) -> dict[str, Any]:
             reasons = "; ".join(f"{n}: {r}" for n, r in skipped.items()) or "none found"
             raise DataLacks(f"{config.data}: no {config.split} sequence can be rolled out ({reasons})")
         rows += found
-    result = {"table": "long", "title": f"Rollouts of {options.long_frames:,} frames", "protocol": NOTE}
+    result: dict[str, Any] = {"table": "long", "title": f"Rollouts of {options.long_frames:,} frames", "protocol": NOTE}
     result |= {"network": path.name, "limits": vars(Limits()), "rows": rows, "skipped": skipped}
     headings = ["", "start", *(heading for heading, _, _ in HEADINGS.values()), "mean from the body [cm]", "verdict"]
     limits = [form.format(scale * getattr(Limits(), key)) for key, (_, scale, form) in HEADINGS.items()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence as Ordered
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -112,9 +113,9 @@ def sweeps(path: Path, rows: Ordered[dict[str, Any]]) -> None:
     having = {key: [row for row in rows if key in row.get("value", {})] for key in SWEPT}
     swept = {key: mine for key, mine in having.items() if len(mine) > 1} or having
     figure, axes = axes_of(len(swept), height=3.6, width=4.6)
-    baselines = next((row["mean"] for row in rows if row["row"] == "baselines"), {})
+    baselines: dict[str, Any] = next((row["mean"] for row in rows if row["row"] == "baselines"), {})
     for axis, (key, mine) in zip(axes, swept.items(), strict=True):
-        mine.sort(key=lambda row, key=key: row["value"][key])
+        mine.sort(key=partial(_swept_value, key))
         for start, line in (("warm", "-"), ("cold", "--")):
             values = [shown(row["mean"][start]["network"]["mean_vertex_error_cm"]) for row in mine]
             axis.plot([row["value"][key] for row in mine], values, f"o{line}", color=COLOURS[start], label=start)
@@ -126,6 +127,10 @@ def sweeps(path: Path, rows: Ordered[dict[str, Any]]) -> None:
         axis.grid(alpha=0.3)
     axes[0].legend(frameon=False, fontsize=8)
     save(figure, path)
+
+
+def _swept_value(key: str, row: dict[str, Any]) -> float:
+    return row["value"][key]
 
 
 def axes_of(

@@ -113,8 +113,8 @@ def measure(
                     if observe is not None:
                         observe(sequence, body, start, newest, vertices)
                 row[method] = figures(vertices, truth, sequence.garment.faces, after, body.faces, geodesic_frames)
-                error = 100.0 * np.linalg.norm(vertices.astype(np.float64) - truth, axis=-1).mean(axis=1)
-                result.curves.setdefault((method, start), []).append(error)
+                errors = 100.0 * np.linalg.norm(vertices.astype(np.float64) - truth, axis=-1).mean(axis=1)
+                result.curves.setdefault((method, start), []).append(errors)
             result.rows.append(row)
     return result
 

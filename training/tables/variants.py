@@ -67,7 +67,7 @@ def table2(network: NetworkConfig) -> list[Variant]:
     for p, r in places:
         name = "as_given" if (p, r) == (power, radius) else f"power_{p:g}" if r == radius else f"radius_{r:g}"
         label = f"p = {p:g}, r = {r:g} m" + (", as given" if name == "as_given" else "")
-        where = (("power", p),) if r == radius else ()
+        where: tuple[tuple[str, float], ...] = (("power", p),) if r == radius else ()
         where += (("radius", r),) if p == power else ()
         rows.append(Variant(name, label, (f"geodesic_power={p!r}", f"geodesic_radius={r!r}"), value=where))
     return rows

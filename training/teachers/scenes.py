@@ -60,7 +60,7 @@ def _check_body(where: str, frames: np.ndarray, faces: np.ndarray) -> None:
 
 def used_body(scene: ClothScene) -> tuple[np.ndarray, np.ndarray]:
     """The body without vertices that no face uses: float32 [T, U', 3], and faces int32 [G, 3]; empty without a body."""
-    if scene.body_frames is None:
+    if scene.body_frames is None or scene.body_faces is None:
         return np.zeros((len(scene), 0, 3), np.float32), np.zeros((0, 3), np.int32)
     used, faces = np.unique(scene.body_faces, return_inverse=True)
     frames = np.ascontiguousarray(np.asarray(scene.body_frames)[:, used], dtype=np.float32)

@@ -111,7 +111,7 @@ class TrainConfig:
 
     def network_config(self) -> NetworkConfig:
         """The network's shape with the overrides applied."""
-        kinds = {f.name: type(f.default) for f in dataclasses.fields(NetworkConfig)}
+        kinds: dict[str, type] = {f.name: type(f.default) for f in dataclasses.fields(NetworkConfig)}
         changes = {}
         for text in self.overrides:
             name, _, value = text.partition("=")

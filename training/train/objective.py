@@ -8,6 +8,8 @@ weights, of which autocast makes copies.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
@@ -41,7 +43,7 @@ class Objective(nn.Module):
 
     def __init__(self, network: GarmentNetwork, config: LossConfig, noise: float, precision: str) -> None:
         super().__init__()
-        self.network, self.config, self.noise, self.half = network, config, noise, precision == "bfloat16"
+        self.network, self.config, self.noise, self.in_bfloat16 = network, config, noise, precision == "bfloat16"
 
     @staticmethod
     def inputs(batch: Batch) -> tuple:
@@ -74,7 +76,7 @@ class Objective(nn.Module):
         if self.noise:
             x = x + self.noise * torch.randn_like(x)
             v = v + self.noise * torch.randn_like(v)
-        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
+        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.in_bfloat16):
             predicted = network.forward_normalised(x, v, weights, face_mask=face_mask, velocity_mask=velocity_mask)
         normalised = network.normalise_targets(NetworkOutput(*target))
         return torch.stack(
@@ -91,7 +93,8 @@ class Trainer:
     """
 
     def __init__(self, objective: Objective | UnrolledObjective, group: Group, compile: bool) -> None:
-        self.compiled, self._worked, self._inputs = compile, False, objective.inputs
+        self.compiled, self._worked = compile, False
+        self._inputs: Callable[..., tuple] = objective.inputs  # of the batches that go with the objective
         if compile:
             objective.compile(dynamic=True)  # the number of faces changes from batch to batch
         self._model: nn.Module = objective

@@ -7,13 +7,16 @@ import json
 import math
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
+from warpgarment.io.npz import write_npz
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
+from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import predict
 from warpgarment.training.samples.loader import Loader, Plan
@@ -47,7 +50,7 @@ class Run:
     def __init__(
         self,
         config: TrainConfig,
-        network,
+        network: GarmentNetwork,
         plan: Plan,
         builder: SampleBuilder,
         validation: list,
@@ -57,11 +60,14 @@ class Run:
         self.config, self.network, self.validation, self.began = config, network, validation, began
         self.out, self.group, self.device = Path(config.out), group, group.device
         self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
-        steps, passes, ahead = config.unroll.steps, config.unroll.collision_passes, config.ahead
+        steps, passes, share = config.unroll.steps, config.unroll.collision_passes, config.pushforward.share
+        self.loader: Loader[Batch] | Loader[UnrolledBatch]
         if steps > 1:
-            builder = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
-            ahead = 0  # a scene's solvers belong to one thread
-        self.loader = Loader(builder, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
+            unrolled = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
+            # built when asked for: a scene's solvers belong to one thread
+            self.loader = Loader(unrolled, plan, self.pool, share, self.splits, 0, part)
+        else:
+            self.loader = Loader(builder, plan, self.pool, share, self.splits, config.ahead, part)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
@@ -93,6 +99,7 @@ class Run:
         """How far the schedule is, 0..1: by steps where their number is given, else by time."""
         if self.config.steps is not None:
             return min(step / self.config.steps, 1.0)
+        assert self.config.time_limit is not None  # one of the two is given, see `TrainConfig`
         return min(self.now / (60.0 * self.config.time_limit), 1.0)
 
     def splits(self, step: int) -> int:
@@ -233,8 +240,8 @@ class Run:
         self.read_losses()
         if not self.group.first or self._saved == (self.step, self.best):
             return
-        progress = {"step": self.step, "elapsed": self.elapsed(), "best": self.best, "pool_step": self.pool.step}
-        progress["recent"] = self.recent
+        progress: dict[str, Any] = {"step": self.step, "elapsed": self.elapsed(), "best": self.best}
+        progress |= {"pool_step": self.pool.step, "recent": self.recent}
         training_state.save(self.out / STATE, self.network, self.average, self.optimizer, self.pool.tensors(), progress)
         self._save_network("network.safetensors")
         self._saved = (self.step, self.best)
@@ -293,7 +300,7 @@ class Run:
         if self.group.first:
             batch = self.loader.build(step, part=slice(None))
             names, frames = zip(*batch.ids, strict=True)
-            np.savez(path, sequence=np.array(names), frame=np.array(frames), **batch.arrays())
+            write_npz(path, {"sequence": np.array(names), "frame": np.array(frames), **batch.arrays()})
         self.group.wait()
         raise NonFiniteLoss(
             f"the loss or gradient of step {step} is not finite; its batch is in {path}. Look for features that are "

@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 
 from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
+from warpgarment.nn.network import GarmentNetwork
 
 
 class Average:
@@ -26,7 +27,7 @@ class Average:
         decay: Of the average; less at first, (1 + n) / (10 + n) after n updates.
     """
 
-    def __init__(self, network: torch.nn.Module, decay: float) -> None:
+    def __init__(self, network: GarmentNetwork, decay: float) -> None:
         self.network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay, self.updates = decay, 0
 

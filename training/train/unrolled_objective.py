@@ -35,9 +35,8 @@ from torch import nn
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.face import LAYOUT
-from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.nn.heading import canonical_frame
-from warpgarment.nn.network import rotate_output
+from warpgarment.nn.network import GarmentNetwork, rotate_output
 from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
 from warpgarment.nn.rows import PaddedView
 from warpgarment.training.samples.augmentation import mirror
@@ -87,11 +86,11 @@ class UnrolledObjective(nn.Module):
     figures = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity", "position_m")
 
     def __init__(
-        self, network: ManifoldAwareTransformer, config: LossConfig, noise: float, precision: str, unroll: UnrollConfig
+        self, network: GarmentNetwork, config: LossConfig, noise: float, precision: str, unroll: UnrollConfig
     ) -> None:
         super().__init__()
         self.network, self.config, self.noise, self.unroll = network, config, noise, unroll
-        self.half = precision == "bfloat16"
+        self.in_bfloat16 = precision == "bfloat16"
 
     @staticmethod
     def inputs(batch: UnrolledBatch) -> tuple[UnrolledBatch]:
@@ -179,12 +178,13 @@ class UnrolledObjective(nn.Module):
         x, v = turned(x, v, turn, batch.joint[garment])
         wanted, mirrored = rotate_output(wanted, turn), batch.mirrored[garment]
         x, v, wanted = mirror(x, v, wanted, mirrored)
-        inputs = network.encode(x, v)
+        x_in, v_in = network.encode(x, v)
         if self.noise:
-            inputs = tuple(part + self.noise * torch.randn_like(part) for part in inputs)
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.half):
+            x_in = x_in + self.noise * torch.randn_like(x_in)
+            v_in = v_in + self.noise * torch.randn_like(v_in)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
             predicted = network.forward_normalised(
-                *inputs, view.weights, face_mask=view.face_mask, velocity_mask=view.component_mask
+                x_in, v_in, view.weights, face_mask=view.face_mask, velocity_mask=view.component_mask
             )
         face_weight = view.faces(batch.face_weight)
         face_weight = face_weight if view.face_mask is None else face_weight * view.face_mask

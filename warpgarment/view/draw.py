@@ -21,6 +21,8 @@ import numpy as np
 from .images import caption, titled, write_mp4, write_png
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warpgarment.objects.body import BodyMotion
     from warpgarment.objects.motion import GarmentMotion
 
@@ -146,8 +148,8 @@ def render(
     camera = camera or Camera.framing(seen, size=size)
 
     view = raster.View()
-    view.right, view.up, view.forward = (tuple(map(float, axis)) for axis in camera.axes())
-    view.eye = tuple(map(float, np.asarray(camera.target) + camera.distance * camera.direction))
+    view.right, view.up, view.forward = (_vec3(axis) for axis in camera.axes())
+    view.eye = _vec3(np.asarray(camera.target) + camera.distance * camera.direction)
     view.width, view.height = size[0] * samples, size[1] * samples
     view.scale = 0.5 * view.height / float(np.tan(np.radians(camera.field_of_view) / 2))
     view.perspective = True
@@ -170,14 +172,14 @@ def _lighting(camera: Camera, seen: np.ndarray, floor: float | None) -> tuple[An
     key, fill = key / np.linalg.norm(key), fill / np.linalg.norm(fill)
 
     stage = shading.Stage()
-    stage.key, stage.fill = tuple(map(float, key)), tuple(map(float, fill))
-    stage.key_color, stage.fill_color = (0.86, 0.79, 0.70), (0.09, 0.11, 0.15)
-    stage.sky, stage.ground = (0.32, 0.35, 0.40), (0.15, 0.13, 0.12)
-    stage.top, stage.bottom = tuple(map(float, linear("#eef1f5"))), tuple(map(float, linear("#dfe3e9")))
-    stage.floor_color = tuple(map(float, linear("#d3d8df")))
+    stage.key, stage.fill = _vec3(key), _vec3(fill)
+    stage.key_color, stage.fill_color = _vec3((0.86, 0.79, 0.70)), _vec3((0.09, 0.11, 0.15))
+    stage.sky, stage.ground = _vec3((0.32, 0.35, 0.40)), _vec3((0.15, 0.13, 0.12))
+    stage.top, stage.bottom = _vec3(linear("#eef1f5")), _vec3(linear("#dfe3e9"))
+    stage.floor_color = _vec3(linear("#d3d8df"))
     stage.has_floor = floor is not None
     stage.floor_height = 0.0 if floor is None else float(floor)
-    stage.focus = tuple(map(float, (seen.min(0) + seen.max(0)) / 2))
+    stage.focus = _vec3((seen.min(0) + seen.max(0)) / 2)
     extent = float(np.linalg.norm(seen.max(0) - seen.min(0)))
     stage.floor_fade = 1.7 * extent
     stage.occlusion_radius = 0.035 * extent
@@ -186,13 +188,20 @@ def _lighting(camera: Camera, seen: np.ndarray, floor: float | None) -> tuple[An
     forward = -key
     side = np.cross(forward, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
-    light.right, light.up = tuple(map(float, side)), tuple(map(float, np.cross(side, forward)))
-    light.forward = tuple(map(float, forward))
-    light.eye = tuple(map(float, np.asarray(stage.focus) + extent * key))
+    light.right, light.up = _vec3(side), _vec3(np.cross(side, forward))
+    light.forward = _vec3(forward)
+    light.eye = _vec3(np.asarray(stage.focus) + extent * key)
     light.width = light.height = 896
     light.scale = light.width / (1.15 * extent + 1e-6)
     light.perspective = False
     return stage, light
+
+
+def _vec3(values: Iterable[float]) -> wp.vec3:
+    """Three numbers as a Warp struct keeps them."""
+    import warp as wp
+
+    return wp.vec3(*values)
 
 
 def chase(motions: Sequence[Motion], *, size: tuple[int, int], azimuth: float = 28.0) -> Camera:

@@ -7,10 +7,11 @@ import torch
 from support import sequences as synthetic_sequences
 from support.runs import config_for
 
+from warpgarment import checkpoint
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.grow import GrowthError, grow
-from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
 from warpgarment.training.samples.pushforward import PushforwardConfig
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.start import train
@@ -112,6 +113,24 @@ def test_training_starts_from_a_grown_network(tmp_path):
     weights = torch.full((1, 9, 9), 1.0 / 9.0)
     for before, after in zip(small(*inputs, weights), large(*inputs, weights), strict=True):
         torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4)  # float32, outputs of order one
+
+
+@pytest.mark.parametrize("preset", ["small", "fast"])
+def test_growing_gives_a_checkpoint_that_loads_or_says_why_not(tmp_path, preset):
+    """If this fails, `--grow` trains a network whose checkpoint cannot be loaded: of faces, set up as of patches."""
+    data = synthetic_sequences.write_set(tmp_path / "set", train=2, frames=16)
+    shape = {"embedding": 16, "layers": 1, "feed_forward": 16, "heads": 2, "manifold_heads": 1, "face_embedding": 16}
+    build_network(getattr(NetworkConfig, preset)(**shape)).save(tmp_path / "small.safetensors")
+    overrides = ("embedding=32", "layers=2", "feed_forward=24", "heads=4", "manifold_heads=2", "face_embedding=16")
+    settings = {"network": preset, "overrides": (*overrides, "dropout=0.0"), "steps": 1, "grow": True}
+    settings |= {"init": tmp_path / "small.safetensors", "pushforward": PushforwardConfig(share=0.0)}
+    config = config_for(data, tmp_path / "run", **settings)
+    if preset == "fast":
+        with pytest.raises(GrowthError, match=r"architecture='patches'.*Leave out grow"):
+            train(config)
+        assert not (tmp_path / "run").exists(), "refused before anything is written"
+    else:
+        assert checkpoint.load(train(config)).config == config.network_config()
 
 
 def test_growing_needs_something_to_grow(tmp_path):

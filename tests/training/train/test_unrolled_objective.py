@@ -14,7 +14,7 @@ from support.runs import config_for, entries_of, losses_of
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
 from warpgarment.sim import differentiable
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
@@ -215,6 +215,29 @@ UNROLLED = {
     "unroll": UnrollConfig(steps=2, position=1.0), "batch_size": 2, "steps": 6, "save_every": 2, "validate_every": 4,
     "statistics_batches": 1, "pushforward": PushforwardConfig(every=2, rollouts=2, steps=2, share=0.5),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["small", "fast"])
+def test_unrolled_work_is_that_of_single_steps(data, kind):
+    """The rates in log.jsonl count other operations for unrolled steps than for single ones, such as no patches: four
+    steps in a row are four times one step on the same faces, exactly."""
+    shape = {"embedding": 16, "layers": 2, "feed_forward": 16, "heads": 2, "dropout": 0.0, "patch_spacing": 0.15}
+    config = getattr(NetworkConfig, kind)(**shape)
+    cache, folder, picks = interactions.default_cache(data), data / "train_0", [(0, 3), (0, 9)]
+    loaded = [SequenceData(Sequence.load(folder), folder, cache, config, torch.device("cpu"))]
+    network, faces = build_network(config), len(loaded[0].faces)
+    single = SampleBuilder(loaded, config, QUIET, PLAIN).build(picks, faces, np.random.default_rng(0))
+    unrolled = UnrolledBuilder(loaded, network, QUIET, PLAIN, 4, 0).build(picks, None, np.random.default_rng(0))
+    samples, operations = single.work(config)
+    assert unrolled.work(config) == (samples, 4 * operations)
+
+
+def test_objectives_keep_the_methods_of_modules(network):
+    """A setting has the name of a method of `nn.Module`, such as `half`, which can no longer be called."""
+    one = Objective(network, LossConfig(), 0.0, "bfloat16")
+    several = UnrolledObjective(network, LossConfig(), 0.0, "bfloat16", UnrollConfig())
+    for objective in (one, several):
+        assert not [name for name in vars(objective) if callable(getattr(torch.nn.Module, name, None))]
 
 
 def test_a_resumed_unrolled_run_repeats_the_uninterrupted_one(data, tmp_path, monkeypatch):

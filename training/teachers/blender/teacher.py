@@ -18,6 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from warpgarment.io.npz import write_npz
 from warpgarment.io.pc2 import write_pc2_to
 from warpgarment.training.teachers import ClothScene, TeacherError
 from warpgarment.training.teachers.scenes import check_scenes, used_body
@@ -125,7 +126,7 @@ def write_scene(folder: Path, scene: ClothScene, settings: BlenderSettings) -> N
         path = np.repeat(arrays["start"][None], len(scene), axis=0)
         path[:, pins] = placed(pin_path(first[pins], body, body_faces))
         write_path("pins.pc2", path)
-    np.savez(folder / "scene.npz", **arrays)  # type: ignore[arg-type]
+    write_npz(folder / "scene.npz", arrays)
     (folder / "scene.json").write_text(json.dumps(numbers))
 
 

@@ -75,7 +75,7 @@ class Worlds:
         with wp.ScopedDevice(device):
             self._before, self._after = (wp.zeros(count, dtype=wp.vec3) for _ in range(2))
             self._points, self._velocities = (wp.zeros(count, dtype=wp.vec3) for _ in range(2))
-            self._body_world = wp.array(np.repeat(np.arange(len(scenes)), np.diff(body_starts)), dtype=int)
+            self._body_world: wp.array = wp.array(np.repeat(np.arange(len(scenes)), np.diff(body_starts)), dtype=int)
             rows = len(scenes) * self._substeps
             self._origin, self._origin_velocity, self._gravity, self._air = (
                 wp.zeros(rows, dtype=wp.vec3) for _ in range(4)
@@ -112,7 +112,7 @@ class Worlds:
         share = 1.0 / self._substeps
         dt = share / self._fps
         at = frame + (np.arange(self._substeps) + 1) * share
-        rows = {name: [] for name in ("origin", "velocity", "gravity", "air")}
+        rows: dict[str, list[np.ndarray]] = {name: [] for name in ("origin", "velocity", "gravity", "air")}
         for scene, path in zip(self.scenes, self._frames, strict=True):
             here, last, previous = (path.origin(at - back * share) for back in range(3))
             velocity = (here - last) / dt

@@ -179,7 +179,7 @@ def patch_layout(
     radius: float,
     power: float,
     device: torch.device | str = "cpu",
-    scale: Sequence[float] | None = None,
+    scale: Sequence[float] | np.ndarray | None = None,
 ) -> PatchLayout:
     """Lays the patches of several garments out in padded rows.
 
