@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.batch import Rolling, scenes_of
 from benchmarks.measure import NO_GPU, Row, aimed
 from benchmarks.networks import Named
-from warpgarment.kernels.linear import conjugate_gradients
+from warpgarment.kernels.linear import progress
 from warpgarment.sim.advance import advance
 from warpgarment.sim.graph import WARM_UP
 from warpgarment.sim.simulator import Simulator
@@ -67,7 +67,7 @@ class FrameCounts:
 
         patches.append(mock.patch.object(wp.Mesh, "refit", counted_refit))
         patches.append(
-            mock.patch.object(conjugate_gradients.Progress, "_warn", return_value=None)
+            mock.patch.object(progress.Progress, "_warn", return_value=None)
         )  # a CPU looks at reports at once
         try:
             for patch in patches:

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 import scipy.sparse.linalg
 import torch
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from tests.support.scenes import (
-    CAPSULE,
     TINY,
     Failing,
     body,
@@ -37,8 +35,6 @@ from warpgarment.objects.pack import PackedGarments
 from warpgarment.objects.status import Verdict
 from warpgarment.sim.pins import BodyPins, barycentric_coordinates
 from warpgarment.sim.simulator import Simulator
-
-CAPSULE.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
 
 
 def test_untrained_residual_network_follows_a_rigid_body():

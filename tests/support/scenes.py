@@ -43,6 +43,7 @@ def outfit() -> Garment:
 
 
 CAPSULE = trimesh.creation.capsule(height=1.0, radius=0.15, count=[16, 16])
+CAPSULE.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
 
 
 def body(frames: int, move=lambda t: (0.0, 0.0, 0.0), turn=lambda t: (0.0, 0.0, 0.0), fps: float = 30.0) -> BodyMotion:
