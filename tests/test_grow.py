@@ -7,7 +7,8 @@ import synthetic_sequences
 import torch
 from training_runs import config_for
 
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, geodesic_weights
+from warpgarment import checkpoint
+from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, build_network, geodesic_weights
 from warpgarment.training.grow import GrowthError, grow
 from warpgarment.training.pushforward import PushforwardConfig
 from warpgarment.training.train import TrainConfig, train
@@ -109,6 +110,24 @@ def test_training_starts_from_a_grown_network(tmp_path):
     weights = torch.full((1, 9, 9), 1.0 / 9.0)
     for before, after in zip(small(*inputs, weights), large(*inputs, weights), strict=True):
         torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4)  # float32, outputs of order one
+
+
+@pytest.mark.parametrize("preset", ["small", "fast"])
+def test_growing_gives_a_checkpoint_that_loads_or_says_why_not(tmp_path, preset):
+    """If this fails, `--grow` trains a network whose checkpoint cannot be loaded: of faces, set up as of patches."""
+    data = synthetic_sequences.write_set(tmp_path / "set", train=2, frames=16)
+    shape = {"embedding": 16, "layers": 1, "feed_forward": 16, "heads": 2, "manifold_heads": 1, "face_embedding": 16}
+    build_network(getattr(NetworkConfig, preset)(**shape)).save(tmp_path / "small.safetensors")
+    overrides = ("embedding=32", "layers=2", "feed_forward=24", "heads=4", "manifold_heads=2", "face_embedding=16")
+    settings = {"network": preset, "overrides": (*overrides, "dropout=0.0"), "steps": 1, "grow": True}
+    settings |= {"init": tmp_path / "small.safetensors", "pushforward": PushforwardConfig(share=0.0)}
+    config = config_for(data, tmp_path / "run", **settings)
+    if preset == "fast":
+        with pytest.raises(GrowthError, match=r"architecture='patches'.*Leave out grow"):
+            train(config)
+        assert not (tmp_path / "run").exists(), "refused before anything is written"
+    else:
+        assert checkpoint.load(train(config)).config == config.network_config()
 
 
 def test_growing_needs_something_to_grow(tmp_path):

@@ -24,28 +24,35 @@ from torch import nn
 
 from warpgarment.attention import EncoderLayer
 from warpgarment.config import NetworkConfig
-from warpgarment.network import STATISTICS, ManifoldAwareTransformer
+from warpgarment.network import STATISTICS, GarmentNetwork, ManifoldAwareTransformer
 
 MAY_DIFFER = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "dropout")
 UNEVEN = 0.5  # how far the shares of the copies of a channel are from equal
 
 
 class GrowthError(ValueError):
-    """A shape that the network cannot be grown to; says which setting is in the way."""
+    """A network that cannot be grown to the shape wanted; says what is in the way."""
 
 
-def grow(small: ManifoldAwareTransformer, config: NetworkConfig, *, seed: int = 0) -> ManifoldAwareTransformer:
+def grow(small: GarmentNetwork, config: NetworkConfig, *, seed: int = 0) -> ManifoldAwareTransformer:
     """A network of another shape that predicts the same, on the device of the given one.
 
     Args:
-        small: Network to start from; its statistics are kept.
+        small: Network to start from, of faces (`architecture="faces"`); its statistics are kept.
         config: Shape wanted: an embedding that is a multiple, at least as many layers, feed-forward channels, learned
             heads and channels of each, and channels of all manifold heads together. `dropout` may differ, nothing else.
         seed: Of what starts at random.
 
     Raises:
-        GrowthError: The shape cannot be grown to.
+        GrowthError: The network is not one of faces, or the shape cannot be grown to.
     """
+    if not isinstance(small, ManifoldAwareTransformer):
+        raise GrowthError(
+            f"only networks of faces can be grown; this one has architecture={small.config.architecture!r}, whose "
+            "layers of faces have no rule for a larger shape. Leave out grow to train it further in its own shape, or "
+            "grow a network of faces and start one of patches from that: init without grow, for a shape of patches "
+            "with its widths"
+        )
     _check(small.config, config)
     device, dtype = small.face_head.weight.device, small.face_head.weight.dtype
     with torch.random.fork_rng(devices=[]), torch.no_grad():
