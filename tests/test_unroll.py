@@ -13,7 +13,7 @@ from training_runs import config_for, entries_of, losses_of
 
 from warpgarment import checkpoint, differentiable
 from warpgarment.metrics import mean_vertex_error
-from warpgarment.network import ManifoldAwareTransformer, NetworkConfig
+from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, build_network
 from warpgarment.simulator import Simulator
 from warpgarment.training import interactions, train, unroll
 from warpgarment.training.augmentation import Augmentation
@@ -211,6 +211,21 @@ UNROLLED = {
     "unroll": UnrollConfig(steps=2, position=1.0), "batch_size": 2, "steps": 6, "save_every": 2, "validate_every": 4,
     "statistics_batches": 1, "pushforward": PushforwardConfig(every=2, rollouts=2, steps=2, share=0.5),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["small", "fast"])
+def test_unrolled_work_is_that_of_single_steps(data, kind):
+    """The rates in log.jsonl count other operations for unrolled steps than for single ones, such as no patches: four
+    steps in a row are four times one step on the same faces, exactly."""
+    shape = {"embedding": 16, "layers": 2, "feed_forward": 16, "heads": 2, "dropout": 0.0, "patch_spacing": 0.15}
+    config = getattr(NetworkConfig, kind)(**shape)
+    cache, folder, picks = interactions.default_cache(data), data / "train_0", [(0, 3), (0, 9)]
+    loaded = [SequenceData(Sequence.load(folder), folder, cache, config, torch.device("cpu"))]
+    network, faces = build_network(config), len(loaded[0].faces)
+    single = SampleBuilder(loaded, config, QUIET, PLAIN).build(picks, faces, np.random.default_rng(0))
+    unrolled = UnrolledBuilder(loaded, network, QUIET, PLAIN, 4, 0).build(picks, None, np.random.default_rng(0))
+    samples, operations = single.work(config)
+    assert unrolled.work(config) == (samples, 4 * operations)
 
 
 def test_a_resumed_unrolled_run_repeats_the_uninterrupted_one(data, tmp_path, monkeypatch):

@@ -28,10 +28,14 @@ factor needs no gradient: the embeddings' inputs and the geodesic weights.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import torch
 
 from warpgarment.config import NetworkConfig
 from warpgarment.kernels.features import FEATURES
+from warpgarment.patches import PatchLayout
 
 PEAKS = (  # part of the device's name, dense bfloat16 with float32 sums [FLOP/s]; the makers' data sheets
     ("B200", 2250e12),
@@ -80,6 +84,21 @@ def step_flops(config: NetworkConfig, samples: int, faces: int, components: int,
     """Operations of a training step, forward and backward, see above."""
     both, one = forward_flops(config, faces, components, patches)
     return samples * (3 * both + 2 * one)
+
+
+def work(config: NetworkConfig, views: Iterable[tuple[int, int, int, Any]]) -> int:
+    """Operations of a training step that shows the network each of these views once.
+
+    Args:
+        config: Of the network.
+        views: Of each call of the network: number of rows, of faces and of components of a row, and the weights it is
+            given, a `PatchLayout` for a network of patches.
+    """
+    total = 0
+    for rows, faces, components, weights in views:
+        patches = weights.start.shape[1] if isinstance(weights, PatchLayout) else 0
+        total += step_flops(config, rows, faces, components, patches)
+    return total
 
 
 def matrix_peak(device: torch.device, precision: str) -> float | None:

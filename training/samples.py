@@ -34,7 +34,7 @@ from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
 from warpgarment.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.patches import Patches, PatchLayout, patch_layout
 from warpgarment.training.augmentation import Augmentation, mirror
-from warpgarment.training.flops import step_flops
+from warpgarment.training.flops import work
 from warpgarment.training.interactions import COLUMNS, unpack
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.sequence_data import SequenceData
@@ -59,8 +59,7 @@ class Batch(NamedTuple):
     def work(self, config: NetworkConfig) -> tuple[int, int]:
         """Samples, and operations of a training step on them (`flops.py`)."""
         samples, faces = self.features.shape[:2]
-        patches = self.weights.start.shape[1] if isinstance(self.weights, PatchLayout) else 0
-        return samples, step_flops(config, samples, faces, self.velocities.shape[1], patches)
+        return samples, work(config, [(samples, faces, self.velocities.shape[1], self.weights)])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is kept of a batch whose loss is not finite."""

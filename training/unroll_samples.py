@@ -22,7 +22,7 @@ from warpgarment.network import ManifoldAwareTransformer
 from warpgarment.scene import Scene
 from warpgarment.timing import Timings
 from warpgarment.training.augmentation import Augmentation
-from warpgarment.training.flops import step_flops
+from warpgarment.training.flops import work
 from warpgarment.training.interactions import COLUMNS, unpack
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.samples import SampleBuilder
@@ -51,8 +51,8 @@ class UnrolledBatch:
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
         """Samples, and operations of a training step on them (`flops.py`)."""
-        each = [step_flops(config, *view.face_index.shape, view.component_index.shape[1]) for view in self.scene.views]
-        return len(self.ids), len(self.recorded) * sum(each)
+        views = [(*view.face_index.shape, view.component_index.shape[1], view.weights) for view in self.scene.views]
+        return len(self.ids), len(self.recorded) * work(config, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is kept of a batch whose loss is not finite."""
