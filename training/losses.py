@@ -78,7 +78,7 @@ def loss(
 def weighted(
     predicted: NormalisedOutput,
     target: NormalisedOutput,
-    network: ManifoldAwareTransformer,
+    network: GarmentNetwork,
     config: LossConfig,
     face_weight: torch.Tensor,
     component_weight: torch.Tensor,
@@ -94,7 +94,7 @@ def weighted(
 
 
 def _differences(
-    predicted: NormalisedOutput, target: NormalisedOutput, network: ManifoldAwareTransformer, config: LossConfig
+    predicted: NormalisedOutput, target: NormalisedOutput, network: GarmentNetwork, config: LossConfig
 ) -> list[torch.Tensor]:
     """Sums of absolute differences per face [B,N], [B,N], and per component [B,C]."""
     parts = [(a.float() - b).abs() for a, b in zip(predicted, target, strict=True)]
