@@ -228,6 +228,14 @@ def test_unrolled_work_is_that_of_single_steps(data, kind):
     assert unrolled.work(config) == (samples, 4 * operations)
 
 
+def test_objectives_keep_the_methods_of_modules(network):
+    """A setting has the name of a method of `nn.Module`, such as `half`, which can no longer be called."""
+    one = Objective(network, LossConfig(), 0.0, "bfloat16")
+    several = UnrolledObjective(network, LossConfig(), 0.0, "bfloat16", UnrollConfig())
+    for objective in (one, several):
+        assert not [name for name in vars(objective) if callable(getattr(torch.nn.Module, name, None))]
+
+
 def test_a_resumed_unrolled_run_repeats_the_uninterrupted_one(data, tmp_path, monkeypatch):
     """As for one-step training: bit for bit on the CPU; and the log has the distance from the recording."""
     train.train(config_for(data, tmp_path / "whole", **UNROLLED))

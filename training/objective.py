@@ -40,7 +40,7 @@ class Objective(nn.Module):
 
     def __init__(self, network: GarmentNetwork, config: LossConfig, noise: float, precision: str) -> None:
         super().__init__()
-        self.network, self.config, self.noise, self.half = network, config, noise, precision == "bfloat16"
+        self.network, self.config, self.noise, self.in_bfloat16 = network, config, noise, precision == "bfloat16"
 
     @staticmethod
     def inputs(batch: Batch) -> tuple:
@@ -73,7 +73,7 @@ class Objective(nn.Module):
         if self.noise:
             x = x + self.noise * torch.randn_like(x)
             v = v + self.noise * torch.randn_like(v)
-        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.half):
+        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.in_bfloat16):
             predicted = network.forward_normalised(x, v, weights, face_mask=face_mask, velocity_mask=velocity_mask)
         normalised = network.normalise_targets(NetworkOutput(*target))
         return torch.stack(

@@ -91,7 +91,7 @@ class UnrolledObjective(nn.Module):
     ) -> None:
         super().__init__()
         self.network, self.config, self.noise, self.unroll = network, config, noise, unroll
-        self.half = precision == "bfloat16"
+        self.in_bfloat16 = precision == "bfloat16"
 
     @staticmethod
     def inputs(batch: UnrolledBatch) -> tuple[UnrolledBatch]:
@@ -182,7 +182,7 @@ class UnrolledObjective(nn.Module):
         inputs = network.encode(x, v)
         if self.noise:
             inputs = tuple(part + self.noise * torch.randn_like(part) for part in inputs)
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.half):
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
             predicted = network.forward_normalised(
                 *inputs, view.weights, face_mask=view.face_mask, velocity_mask=view.component_mask
             )
