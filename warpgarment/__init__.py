@@ -6,15 +6,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import demo, draw, geodesics, memory, metrics
+    from . import demo, draw, geodesics, kernels, memory, metrics
     from .body import BodyMotion
     from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
     from .fitting import fit
     from .garment import Garment
     from .motion import GarmentMotion
-    from .network import ManifoldAwareTransformer, NetworkConfig
+    from .network import ManifoldAwareTransformer, NetworkConfig, PatchTransformer
     from .simulator import Simulator
     from .status import RolloutStatus, Verdict
+
+    __version__: str
 
 __all__ = [
     "BodyMotion",
@@ -26,13 +28,16 @@ __all__ = [
     "MissingExtra",
     "NetworkConfig",
     "NotEnoughMemory",
+    "PatchTransformer",
     "RolloutStatus",
     "Simulator",
     "Verdict",
+    "__version__",
     "demo",
     "draw",
     "fit",
     "geodesics",
+    "kernels",
     "memory",
     "metrics",
 ]
@@ -48,6 +53,7 @@ _HOME = {
     "MissingExtra": "errors",
     "NetworkConfig": "network",
     "NotEnoughMemory": "errors",
+    "PatchTransformer": "network",
     "RolloutStatus": "status",
     "Simulator": "simulator",
     "Verdict": "status",
@@ -58,8 +64,14 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = importlib.import_module(f".{_HOME.get(name, name)}", __name__)
-    value = getattr(home, name) if name in _HOME else home
+    value: Any
+    if name == "__version__":  # of what is installed
+        from importlib.metadata import version
+
+        value = version(__name__)
+    else:
+        home = importlib.import_module(f".{_HOME.get(name, name)}", __name__)
+        value = getattr(home, name) if name in _HOME else home
     globals()[name] = value
     return value
 
