@@ -17,6 +17,7 @@ import numpy as np
 
 from warpgarment.cache import cache_folder
 from warpgarment.errors import MissingExtra
+from warpgarment.io.atomic import atomic_file
 
 from .mesh_cutting import averaging, boundary_loops, compacted, without_short_edges
 
@@ -190,10 +191,9 @@ def anny_bodies() -> AnnyBodies:
     """Anny on the light template; the first call on a machine builds the cache (about two minutes)."""
     cache = cache_folder() / f"anny_template_{TEMPLATE_FACES}_v{_CACHE_VERSION}.npz"
     if not cache.exists():
-        cache.parent.mkdir(parents=True, exist_ok=True)
-        partial = cache.with_name(f"{cache.stem}.{os.getpid()}.npz")
-        np.savez(partial, **_build_template())
-        partial.replace(cache)
+        template = _build_template()
+        with atomic_file(cache) as partial:
+            np.savez(partial, **template)
     return AnnyBodies(cache)
 
 

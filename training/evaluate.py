@@ -15,8 +15,6 @@ the same way, with `measure`.
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +24,7 @@ import tyro
 
 from warpgarment import checkpoint
 from warpgarment.errors import MissingExtra
+from warpgarment.io.atomic import atomic_file
 from warpgarment.simulator import Simulator
 from warpgarment.training.tables.errors import OptionMissing
 from warpgarment.training.tables.options import TableName, TableOptions
@@ -142,11 +141,13 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
 
 def write(out: Path, result: dict[str, Any], curves: dict[tuple[str, str], list[np.ndarray]], *, picture: bool) -> None:
     """Writes the result files, each under another name first."""
-    out.mkdir(parents=True, exist_ok=True)
-    _replace(out / "evaluation.json", lambda path: path.write_text(json.dumps(plain(result), indent=1), "utf-8"))
-    _replace(out / "evaluation.md", lambda path: path.write_text(table(result), "utf-8"))
+    with atomic_file(out / "evaluation.json") as path:
+        path.write_text(json.dumps(plain(result), indent=1), "utf-8")
+    with atomic_file(out / "evaluation.md") as path:
+        path.write_text(table(result), "utf-8")
     if picture:
-        _replace(out / "error_over_time.png", lambda path: draw(path, curves))
+        with atomic_file(out / "error_over_time.png") as path:
+            draw(path, curves)
 
 
 def table(result: dict[str, Any]) -> str:
@@ -205,15 +206,6 @@ def _describe(path: Path, simulator: Simulator) -> dict[str, Any]:
 
 def _row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
-
-
-def _replace(path: Path, make: Callable[[Path], Any]) -> None:
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
-        make(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _pyplot():
