@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from warpgarment.io.atomic import atomic_files
+from warpgarment.markdown import table
 from warpgarment.simulator import Simulator
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, TeacherError, make_teacher
 
@@ -120,10 +121,8 @@ def markdown(about: dict[str, str], command: str, found: list[dict[str, Any]]) -
         "The bundled dress on its walking body. On a CPU one process on one thread: frames an hour",
     ]
     lines += ["are per core. First frame: building, compiling and the first frame itself.", ""]
-    lines += [
-        "| teacher | device | faces | worlds | first frame s | s a frame | frames/s, all worlds | frames an hour |"
-    ]
-    lines += ["| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    names = ["teacher", "device", "faces", "worlds", "first frame s", "s a frame", "frames/s, all worlds"]
+    cells = []
     for row in found:
         shown = [row["teacher"], row["device"], f"{row['faces']:,}", f"{row['worlds']:,}"]
         if "note" in row:
@@ -131,8 +130,8 @@ def markdown(about: dict[str, str], command: str, found: list[dict[str, Any]]) -
         else:
             shown += [f"{row['first_frame_s']:.1f}", f"{row['frame_s']:.3f}", f"{row['frames_per_s']:.2f}"]
             shown += [f"{row['frames_per_hour']:,}"]
-        lines.append("| " + " | ".join(shown) + " |")
-    return "\n".join(lines) + "\n"
+        cells.append(shown)
+    return "\n".join([*lines, *table([*names, "frames an hour"], cells, text=2)]) + "\n"
 
 
 def main() -> None:
@@ -167,9 +166,9 @@ def main() -> None:
         f"{' '.join(map(str, options.faces))} --worlds {' '.join(map(str, worlds))} --frames {options.frames}"
     )
     target = options.out / f"teacher_{options.teacher}_{options.device.replace(':', '')}"
-    with atomic_files(target.with_suffix(".json"), target.with_suffix(".md")) as (data, table):
+    with atomic_files(target.with_suffix(".json"), target.with_suffix(".md")) as (data, page):
         data.write_text(json.dumps({"machine": about, "command": command, "settings": used, "rows": found}, indent=1))
-        table.write_text(markdown(about, command, found))
+        page.write_text(markdown(about, command, found))
     print(f"written {target}.md")
 
 

@@ -39,6 +39,7 @@ from warpgarment.training.tables.protocol import (
     plain,
     skipped_lines,
 )
+from warpgarment.training.tables.report import grid
 from warpgarment.training.training_set import folders_of
 
 
@@ -163,15 +164,17 @@ def table(result: dict[str, Any]) -> str:
         "",
     ]
     headings = [heading for heading, _ in FIGURES.values()]
-    lines += _row(["start", "method", *headings, "failed"]), _row(["---"] * (len(headings) + 3))
+    rows: list[list[str]] = []
     for start, methods in result["mean"].items():
-        lines += [_row([start, method, *cells(f), str(f["failed"])]) for method, f in methods.items()]
-    lines += ["", _row(["sequence", "start", "frames", "method", *headings]), _row(["---"] * (len(headings) + 4))]
+        rows += [[start, method, *cells(f), str(f["failed"])] for method, f in methods.items()]
+    lines += [*grid(["start", "method", *headings, "failed"], rows), ""]
+    rows = []
     for row in result["sequences"]:
         for method in METHODS:
             if method in row:
-                lines.append(_row([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])]))
-    lines += ["", *skipped_lines(result["skipped"])]
+                rows.append([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])])
+    lines += [*grid(["sequence", "start", "frames", "method", *headings], rows), ""]
+    lines += skipped_lines(result["skipped"])
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -202,10 +205,6 @@ def draw(path: Path, curves: dict[tuple[str, str], list[np.ndarray]]) -> None:
 def _describe(path: Path, simulator: Simulator) -> dict[str, Any]:
     _, notes = checkpoint.read_metadata(path)
     return {"file": path.name, "config": vars(simulator.network.config), "notes": notes}
-
-
-def _row(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def _pyplot():
