@@ -33,10 +33,11 @@ import scipy.sparse
 import torch
 
 from . import cg, compliance, factor
+from ._operator import pack
 from ._torch import expect
 from .body_meshes import BodyMeshes
 from .collision_operator import ADJOINT_TOLERANCE as ADJOINT_TOLERANCE
-from .collision_operator import model_of
+from .collision_operator import Model
 from .compliance import Compliance
 from .contacts import contacts
 from .factor import Factor
@@ -100,7 +101,7 @@ class CollisionSolver:
         dense = Compliance.build(base.tocsr(), system, largest_compliance, compliance_budget)
         budget = factor_budget if one_core else 0
         factors = Factor.build(base.tocsr(), system, explicit=False, budget=budget, skip=dense.base.cpu().numpy() >= 0)
-        self._model = model_of(system, dense, factors, torch.from_numpy(vertex_component).to(device), one_core)
+        self._model = pack(Model(system, dense, factors, torch.from_numpy(vertex_component).to(device), one_core))
         self._progress = cg.Progress("CollisionSolver")
         self._contacts: torch.Tensor | None = None
         self.vertex_count = vertex_count

@@ -12,11 +12,13 @@ Each component is solved in the first of these ways that its solver was built fo
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
 
 from . import cg, compliance_lanes, contact_forces, triangular, wide_contacts
-from ._operator import allocate
+from ._operator import allocate, unpack
 from ._torch import torch_stream
 from .compliance import Compliance
 from .contacts import contact_gap
@@ -32,25 +34,20 @@ The residual is a bound, and the error in the energy norm a small part of it. Me
 """
 
 
-Parts = tuple[cg.System, Compliance, Factor, torch.Tensor, bool]
+class Model(NamedTuple):
+    """What is constant of a solver; it travels through the operators as one list (`_operator.pack`)."""
 
-
-def model_of(
-    system: cg.System, dense: Compliance, factor: Factor, vertex_component: torch.Tensor, one_core: bool
-) -> list[torch.Tensor]:
-    """The tensors of a solver, which travel through the operators as one list."""
-    return [*system, *dense, *factor, vertex_component, torch.tensor(one_core)]
-
-
-def _parts(model: list[torch.Tensor]) -> Parts:
-    ends = [len(kind._fields) for kind in (cg.System, Compliance, Factor)]
-    first, second, third = ends[0], ends[0] + ends[1], sum(ends)
-    system, dense, factor = cg.System(*model[:first]), Compliance(*model[first:second]), Factor(*model[second:third])
-    return system, dense, factor, model[third], bool(model[third + 1])
+    system: cg.System
+    dense: Compliance
+    factor: Factor
+    vertex_component: torch.Tensor
+    """int32 [V]."""
+    one_core: bool
+    """Whether solves are laid out for one CPU core."""
 
 
 def _solve(
-    parts: Parts,
+    model: Model,
     normal: torch.Tensor,
     gap: torch.Tensor,
     tolerance: torch.Tensor,
@@ -63,13 +60,12 @@ def _solve(
     Returns:
         D float64 [V,3] (not where a load is given), forces float64 [V], iterations int32 [C], error float64 [C].
     """
-    system, dense, factor, vertex_component, one_core = parts
+    system, dense, factor, vertex_component, one_core = model
     count, device = len(tolerance), normal.device
     force = torch.zeros(len(normal), dtype=torch.float64, device=device)
-    inverted, factored = int(dense.sizes[1]), int(factor.counts[0])
-    if inverted + factored < count:
+    if dense.inverted + factor.factored < count:
         right = normal * gap[:, None] if load is None else load
-        if inverted + factored:  # the others' loads are zero, which takes no iterations
+        if dense.inverted + factor.factored:  # the others' loads are zero, which takes no iterations
             left = (dense.base < 0) & (factor.base < 0)
             right = right * left[vertex_component.long(), None]
         increment, report, error = cg.solve(system, normal, right, tolerance, relative, max_iterations)
@@ -79,15 +75,15 @@ def _solve(
         report, error = (allocate((count,), dtype, device) for dtype in (torch.int32, torch.float64))
     results = increment, report, error
     limit = RESIDUAL * tolerance
-    if inverted and one_core:
+    if dense.inverted and one_core:
         force += wide_contacts.solve(system, dense, normal, gap, limit, relative, max_iterations, *results)
-    elif inverted:
+    elif dense.inverted:
         listed = compliance_lanes.list_contacts(system, normal)
         y = compliance_lanes.solve(system, dense, listed, normal, gap, limit, relative, max_iterations, report, error)
         if load is None:
             compliance_lanes.displace(system, dense, vertex_component, listed, normal, y, increment)
         force += y
-    if factored:
+    if factor.factored:
         force += contact_forces.solve(system, factor, normal, gap, limit, relative, max_iterations, *results)
     return increment, force, report, error
 
@@ -118,7 +114,7 @@ def collision_solve(
             ],
             device=device,
         )
-    increment, _, report, error = _solve(_parts(model), normal, gap, tolerance, 0.0, max_iterations)
+    increment, _, report, error = _solve(unpack(model, Model), normal, gap, tolerance, 0.0, max_iterations)
     return (vertices.double() + increment).to(torch.float32), report, error
 
 
@@ -138,11 +134,12 @@ def collision_solve_backward(
 ) -> torch.Tensor:
     """g - n (n·λ) with A λ = g; n·λ is the force that the gap n·(B⁻¹ g) would cause."""
     normal, g = normal.contiguous(), grad.double().contiguous()
-    parts = system, dense, factor, vertex_component, _ = _parts(model)
+    parts = unpack(model, Model)
+    system, dense, factor, vertex_component, _ = parts
     gap = torch.zeros(len(g), dtype=torch.float64, device=g.device)
-    if int(dense.sizes[1]):
+    if dense.inverted:
         gap = compliance_lanes.respond(system, dense, vertex_component, normal, g)
-    if int(factor.counts[0]):
+    if factor.factored:
         response = torch.zeros_like(g)
         triangular.solve(system, factor, vertex_component, g, response)
         gap += (normal * response).sum(1)

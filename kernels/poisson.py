@@ -34,11 +34,12 @@ import scipy.sparse
 import torch
 
 from . import cg, factor
+from ._operator import pack
 from ._torch import expect
 from .laplacian import as_numpy, components, cotangent_laplacian, half_cotangents
 from .poisson_kernels import FREE, ISOLATED, PINNED
 from .poisson_operator import ADJOINT_TOLERANCE as ADJOINT_TOLERANCE
-from .poisson_operator import MODEL
+from .poisson_operator import MODEL, Matrix
 
 TOLERANCE = 3e-7
 """Error of conjugate gradients in the energy norm as a share of the rest bounding box diagonal.
@@ -135,7 +136,7 @@ class PoissonSolver:
         explicit = device.type != "cpu" if explicit is None else explicit
         grounded = (matrix + scipy.sparse.diags(_ground(matrix, vertex_component, kind))).tocsr()
         factors = factor.Factor.build(grounded, system, explicit=explicit, budget=factor_budget)
-        self._model = [*(tensors[name] for name, _ in MODEL), *system, *factors]
+        self._model = [*(tensors[name] for name, _ in MODEL), *pack(Matrix(system, factors))]
         self._progress = cg.Progress("PoissonSolver")
         self.rest_vertices, self.faces = tensors["rest_vertices"], tensors["faces"]
         self.pins = tensors["pins"]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
 
 from . import cg, triangular
-from ._operator import allocate
+from ._operator import allocate, unpack
 from ._torch import torch_stream
 from .factor import Factor
 from .poisson_kernels import phi_adjoint, place, place_adjoint, right_hand_side
@@ -14,7 +16,7 @@ from .poisson_kernels import phi_adjoint, place, place_adjoint, right_hand_side
 ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
 
-# The tensors of a solver travel through the operators as one list, in this order; cg.System and Factor follow.
+# The tensors of a solver travel through the operators as one list, in this order; `Matrix` follows.
 MODEL = (
     ("rest_vertices", wp.vec3),
     ("faces", wp.int32),
@@ -32,26 +34,32 @@ MODEL = (
     ("no_normal", wp.vec3d),
     ("tolerance", None),
 )
-_SYSTEM = len(MODEL)
-_FACTOR = _SYSTEM + len(cg.System._fields)
+
+
+class Matrix(NamedTuple):
+    """The matrix of a solver."""
+
+    system: cg.System
+    factor: Factor
 
 
 def _views(model: list[torch.Tensor]) -> dict[str, object]:
-    names = zip(MODEL, model[:_SYSTEM], strict=True)
-    return {name: cg.view(tensor, dtype) for (name, dtype), tensor in names if dtype is not None}
+    tensors = _named(model)
+    return {name: cg.view(tensors[name], dtype) for name, dtype in MODEL if dtype is not None}
 
 
 def _start_rows(model: list[torch.Tensor]) -> list[object]:
-    return [cg.view(tensor, wp.int32) for tensor in model[_SYSTEM : _SYSTEM + 2]]
+    system = matrix_of(model).system
+    return [cg.view(system.start, wp.int32), cg.view(system.rows, wp.int32)]
 
 
 def _solve(
     model: list[torch.Tensor], rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """(L + W) D = g: directly where there is a factor, or else as `cg.solve`, which says what is returned."""
-    system, factor = cg.System(*model[_SYSTEM:_FACTOR]), Factor(*model[_FACTOR:])
+    system, factor = matrix_of(model)
     tensors = _named(model)
-    if int(factor.counts[1]):
+    if factor.unfactored:
         load = factor.without(rhs, tensors["vertex_component"])
         solution, report, error = cg.solve(system, tensors["no_normal"], load, tolerance, relative, max_iterations)
     else:
@@ -62,7 +70,12 @@ def _solve(
 
 
 def _named(model: list[torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {name: tensor for (name, _), tensor in zip(MODEL, model[:_SYSTEM], strict=True)}
+    return {name: tensor for (name, _), tensor in zip(MODEL, model[: len(MODEL)], strict=True)}
+
+
+def matrix_of(model: list[torch.Tensor]) -> Matrix:
+    """The matrix among the tensors of a solver."""
+    return unpack(model[len(MODEL) :], Matrix)
 
 
 @torch.library.custom_op("warpgarment::poisson_solve", mutates_args=())

@@ -228,13 +228,13 @@ def solve(
         rhs: b, float64 [V,3].
         solution: x, float64 [V,3]; rows of other components are not touched.
     """
-    if len(rhs) == 0 or not int(factor.counts[0]):
+    if len(rhs) == 0 or not factor.factored:
         return
     common = [cg.view(system.start, wp.int32), cg.view(system.rows, wp.int32)]
     load, result = cg.view(rhs, wp.vec3d), cg.view(solution, wp.vec3d)
     with torch_stream(rhs.device) as device:
-        if not int(factor.counts[2]):
-            scratch = allocate((int(factor.counts[3]), 4), torch.float64, rhs.device)
+        if not factor.explicit:
+            scratch = allocate((factor.places, 4), torch.float64, rhs.device)
             inputs = [*common, *substitution(factor), load, cg.view(scratch, wp.vec4d), result]
             wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
             return

@@ -10,8 +10,10 @@ import warp as wp
 from poison import poison_outputs
 from reference import collision as reference
 
-from warpgarment.kernels import cg, collision, compliance
+from warpgarment.kernels import collision, compliance
+from warpgarment.kernels._operator import unpack
 from warpgarment.kernels.body_meshes import BodyMeshes
+from warpgarment.kernels.collision_operator import Model
 
 EPSILON = 0.004
 TOLERANCE = 2e-5
@@ -156,7 +158,7 @@ def test_packed_batch_is_the_garments_one_by_one(one_core):
 
 def inverted(solver: collision.CollisionSolver) -> list[int]:
     """Where the inverse of each component begins; -1 without one."""
-    return solver._model[len(cg.System._fields)].tolist()
+    return unpack(solver._model, Model).dense.base.tolist()
 
 
 def test_budgets_are_kept():
@@ -168,7 +170,7 @@ def test_budgets_are_kept():
     for factors in (2**20, 0):
         solver = solver_for(both, compliance_budget=entries, factor_budget=factors)
         assert inverted(solver) == [0, -1]
-        assert len(solver._model[11]) == entries
+        assert len(unpack(solver._model, Model).dense.values) == entries
         result = solver.refine(torch.tensor(both.vertices), body_of(ellipsoid()))
         np.testing.assert_allclose(result, expected, atol=TOLERANCE)
 

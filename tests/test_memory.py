@@ -13,9 +13,10 @@ from test_simulator import network, skirt, tube, walk
 from warpgarment import memory
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.garment import Garment
-from warpgarment.kernels.collision_operator import _parts as parts
-from warpgarment.kernels.factor import Factor
+from warpgarment.kernels._operator import pack, unpack
+from warpgarment.kernels.collision_operator import Model
 from warpgarment.kernels.poisson import PoissonSolver
+from warpgarment.kernels.poisson_operator import matrix_of
 from warpgarment.network import NetworkConfig, build_network
 from warpgarment.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
 from warpgarment.simulator import Simulator
@@ -57,7 +58,8 @@ def pooled(around: int, along: int) -> Garment:
 
 def factor_of(solver) -> list[torch.Tensor]:
     """The factor among what a solver's operator is given, found as the solver itself finds it."""
-    return list(solver._model[-len(Factor._fields) :]) if isinstance(solver, PoissonSolver) else parts(solver._model)[2]
+    model = solver._model
+    return pack((matrix_of(model) if isinstance(solver, PoissonSolver) else unpack(model, Model)).factor)
 
 
 SMALL, BASE, FAST = (kind(layers=1) for kind in (NetworkConfig.small, NetworkConfig.base, NetworkConfig.fast))
