@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import Row
+from warpgarment.view.markdown import table
 
 TITLES = {
     "geodesics": "Distances over the cloth",
@@ -57,13 +58,13 @@ def _targets(rows: Sequence[Row]) -> list[str]:
     if not rows:
         return []
     lines = ["## Targets", "", "Time targets hold for medians; ratios are of least times.", ""]
-    lines += _head(["faces", "batch", "what", "beside", "target", "reached", "met"], text=_TEXT)
+    names = ["faces", "batch", "what", "beside", "target", "reached", "met"]
+    shown = []
     for row in rows:
         what = " ".join([row["what"], *([f"({row['network']})"] if "network" in row else [])])
         cells = [_count(row, "faces"), _count(row, "batch"), what, row.get("reference", "-")]
-        cells += [row["target"], row["reached"], "yes" if row["met"] else "**no**"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return [*lines, ""]
+        shown.append([*cells, row["target"], row["reached"], "yes" if row["met"] else "**no**"])
+    return [*lines, *table(names, shown, text=_TEXT), ""]
 
 
 def _times(rows: Sequence[Row]) -> list[str]:
@@ -83,10 +84,9 @@ def _times(rows: Sequence[Row]) -> list[str]:
         "off by it": lambda row: _off(row, "reference_error_mm"),
         "ratio": lambda row: f"{row['ratio']:.2f}" if "ratio" in row else "-",
     }
-    table = {name: [cell(row) for row in rows] for name, cell in columns.items()}
-    table = {name: cells for name, cells in table.items() if set(cells) != {"-"}}
-    lines = _head(list(table), text=_TEXT)
-    return lines + ["| " + " | ".join(cells) + " |" for cells in zip(*table.values(), strict=True)]
+    shown = {name: [cell(row) for row in rows] for name, cell in columns.items()}
+    shown = {name: cells for name, cells in shown.items() if set(cells) != {"-"}}
+    return table(list(shown), zip(*shown.values(), strict=True), text=_TEXT)
 
 
 def _roofline(rows: Sequence[Row]) -> list[str]:
@@ -108,7 +108,7 @@ def _roofline(rows: Sequence[Row]) -> list[str]:
         "GFLOP/s",
         "achieved",
     ]
-    lines += ["", *_head(names, text=_TEXT)]
+    shown = []
     for row in rows:
         if row["what"].startswith("device: "):
             continue
@@ -119,28 +119,21 @@ def _roofline(rows: Sequence[Row]) -> list[str]:
             cells += [_ms(row, "min_ms"), _ms(row, "median_ms"), f"{row['operations'] / 1e9:.2f}"]
             cells += [f"{row['bytes'] / 1e6:.0f}", _ms(row, "floor_ms"), row["bound"]]
             cells += [f"{row['rate'] / 1e9:,.1f}", f"{row['achieved']:.0%}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+        shown.append(cells)
+    return [*lines, "", *table(names, shown, text=_TEXT)]
 
 
 def _profile(rows: Sequence[Row]) -> list[str]:
     keys = ["warp_launches", "torch_operators", "refits", "host_reads", "synchronisations", "launches"]
     keys += ["graph_launches", "copies"]
-    lines = _head(["faces", "batch", "network", "what", *(key.replace("_", " ") for key in keys)], text=_TEXT)
+    names = ["faces", "batch", "network", "what", *(key.replace("_", " ") for key in keys)]
+    shown = []
     for row in rows:
         cells = [_count(row, "faces"), _count(row, "batch"), row.get("network", "-"), row["what"]]
         if "note" in row:
             cells[-1] += f": {row['note']}"
-        cells += [f"{row[key]:g}" if key in row else "-" for key in keys]
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
-
-
-def _head(names: Sequence[str], text: Sequence[str]) -> list[str]:
-    return [
-        "| " + " | ".join(names) + " |",
-        "| " + " | ".join("---" if name in text else "---:" for name in names) + " |",
-    ]
+        shown.append(cells + [f"{row[key]:g}" if key in row else "-" for key in keys])
+    return table(names, shown, text=_TEXT)
 
 
 def _count(row: Row, key: str) -> str:

@@ -14,10 +14,11 @@ from benchmarks.measure import Call, Row, aimed, aimed_time, compared, tensor
 from benchmarks.scenes import Dressed
 from warpgarment.kernels import deformation
 from warpgarment.kernels.collision.body_contacts import contacts
-from warpgarment.kernels.collision.solver import TOLERANCE, CollisionSolver
+from warpgarment.kernels.collision.solver import CollisionSolver
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.objects.garment import Garment
+from warpgarment.training.bodies.limb_clearance import TOLERANCE
 
 NOT_INSTALLED = "not installed"
 EPSILON = 0.004  # metres kept from the body

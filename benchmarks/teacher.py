@@ -31,6 +31,7 @@ from benchmarks.scenes import dressed
 from warpgarment.io.atomic import atomic_files
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, TeacherError, make_teacher
+from warpgarment.view.markdown import table
 
 WORLDS = {"cpu": (1, 4), "cuda": (1, 4, 16, 64, 256, 1024)}
 STARTS = 24  # frames of the walk that worlds start at
@@ -119,10 +120,8 @@ def markdown(about: dict[str, str], command: str, found: list[dict[str, Any]]) -
         "The bundled dress on its walking body. On a CPU one process on one thread: frames an hour",
     ]
     lines += ["are per core. First frame: building, compiling and the first frame itself.", ""]
-    lines += [
-        "| teacher | device | faces | worlds | first frame s | s a frame | frames/s, all worlds | frames an hour |"
-    ]
-    lines += ["| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    names = ["teacher", "device", "faces", "worlds", "first frame s", "s a frame", "frames/s, all worlds"]
+    cells = []
     for row in found:
         shown = [row["teacher"], row["device"], f"{row['faces']:,}", f"{row['worlds']:,}"]
         if "note" in row:
@@ -130,8 +129,8 @@ def markdown(about: dict[str, str], command: str, found: list[dict[str, Any]]) -
         else:
             shown += [f"{row['first_frame_s']:.1f}", f"{row['frame_s']:.3f}", f"{row['frames_per_s']:.2f}"]
             shown += [f"{row['frames_per_hour']:,}"]
-        lines.append("| " + " | ".join(shown) + " |")
-    return "\n".join(lines) + "\n"
+        cells.append(shown)
+    return "\n".join([*lines, *table([*names, "frames an hour"], cells, text=2)]) + "\n"
 
 
 def main() -> None:
@@ -166,9 +165,9 @@ def main() -> None:
         f"{' '.join(map(str, options.faces))} --worlds {' '.join(map(str, worlds))} --frames {options.frames}"
     )
     target = options.out / f"teacher_{options.teacher}_{options.device.replace(':', '')}"
-    with atomic_files(target.with_suffix(".json"), target.with_suffix(".md")) as (data, table):
+    with atomic_files(target.with_suffix(".json"), target.with_suffix(".md")) as (data, page):
         data.write_text(json.dumps({"machine": about, "command": command, "settings": used, "rows": found}, indent=1))
-        table.write_text(markdown(about, command, found))
+        page.write_text(markdown(about, command, found))
     print(f"written {target}.md")
 
 

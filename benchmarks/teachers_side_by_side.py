@@ -33,6 +33,7 @@ from warpgarment.objects.motion import GarmentMotion
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, make_teacher
 from warpgarment.training.teachers.checks import hanging_strip, pendulum, rest_on_sphere
 from warpgarment.view import draw
+from warpgarment.view.markdown import table
 
 RESULTS = Path(__file__).parent / "results"
 WIDER = 0.020  # gap between the T-shirt and the one over it [m]
@@ -143,15 +144,16 @@ def markdown(about: dict[str, str], rows: list[dict], checks: list[dict], frames
     """The results as tables."""
     lines = ["# Physics teachers side by side", "", ", ".join(f"{k} {v}" for k, v in about.items()), ""]
     lines += [f"`python -m benchmarks.teachers_side_by_side --frames {frames}`, default settings and material.", ""]
-    lines += ["| scene | teacher | " + " | ".join(NAMES.values()) + " |", "| --- | --- " + "| ---: " * len(NAMES) + "|"]
-    for row in rows:
-        cells = [f"{row[name]:.2f}" if name in row else "-" for name in NAMES]
-        lines.append(f"| {row['scene']} | {row['teacher']} | " + " | ".join(cells) + " |")
+    cells = [
+        [row["scene"], row["teacher"], *(f"{row[name]:.2f}" if name in row else "-" for name in NAMES)] for row in rows
+    ]
+    lines += table(["scene", "teacher", *NAMES.values()], cells, text=2)
     lines += ["", "Against known answers, with default settings:", ""]
-    lines += ["| check | teacher | measured | expected | error % |", "| --- | --- | ---: | ---: | ---: |"]
+    cells = []
     for row in checks:
-        value = f"{row['measured']:.3g} {row['unit']} | {row['expected']:.3g} {row['unit']}"
-        lines.append(f"| {row['check']} | {row['teacher']} | {value} | {100 * row['error']:.1f} |")
+        values = [f"{row[name]:.3g} {row['unit']}" for name in ("measured", "expected")]
+        cells.append([row["check"], row["teacher"], *values, f"{100 * row['error']:.1f}"])
+    lines += table(["check", "teacher", "measured", "expected", "error %"], cells, text=2)
     lines += ["", NOTE]
     return "\n".join(lines) + "\n"
 

@@ -6,14 +6,16 @@ it; its backward is a second custom operator that launches the kernel's adjoint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from typing import Any, TypeVar, get_type_hints
 
 import torch
 import warp as wp
 
 from .launch import as_argument, as_warp, torch_stream
 
+_Model = TypeVar("_Model")
 Outputs = dict[str, tuple[type, tuple[int, ...]]]  # name -> (Warp element type, shape of one row)
 
 
@@ -144,6 +146,56 @@ def row_operator(
 
     operator.register_autograd(pull_back, setup_context=save)
     return operator
+
+
+def pack(model: tuple[Any, ...]) -> list[torch.Tensor]:
+    """A named tuple as the one list of tensors that an operator takes.
+
+    Args:
+        model: Its fields are tensors, numbers, which travel as tensors of no dimension on the host, and other such
+            tuples, whose fields take their place.
+    """
+    found: list[torch.Tensor] = []
+    for value in model:
+        if isinstance(value, torch.Tensor):
+            found.append(value)
+        else:
+            found += pack(value) if isinstance(value, tuple) else [torch.tensor(value)]
+    return found
+
+
+def unpack(packed: Sequence[torch.Tensor], kind: type[_Model]) -> _Model:
+    """What `pack` was given: a named tuple of this kind. Reads nothing from a device.
+
+    Args:
+        packed: The list.
+        kind: Class of the tuple; its types say which fields are numbers.
+
+    Raises:
+        ValueError: The list has another length.
+    """
+    values = iter(packed)
+    try:
+        model = _unpacked(values, kind)
+    except StopIteration:
+        raise ValueError(f"{len(packed)} tensors are too few for a {kind.__name__}") from None
+    if left := len(list(values)):
+        raise ValueError(f"{len(packed)} tensors are {left} too many for a {kind.__name__}")
+    return model
+
+
+def _unpacked(values: Iterator[torch.Tensor], kind: Any) -> Any:
+    if kind is torch.Tensor:
+        return next(values)
+    if kind in (int, bool, float):
+        return kind(next(values))
+    return kind(*[_unpacked(values, field) for field in _types(kind)])
+
+
+@lru_cache
+def _types(kind: type) -> tuple[Any, ...]:
+    """The types of a named tuple's fields, in order."""
+    return tuple(get_type_hints(kind).values())
 
 
 def _schema(arguments: Sequence[str], results: int) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from warpgarment.nn.config import NetworkConfig
     from warpgarment.nn.faces.network import ManifoldAwareTransformer
+    from warpgarment.nn.patches.network import PatchTransformer
     from warpgarment.objects.body import BodyMotion
     from warpgarment.objects.fit import fit
     from warpgarment.objects.garment import Garment
@@ -16,10 +17,12 @@ if TYPE_CHECKING:
     from warpgarment.sim.simulator import Simulator
     from warpgarment.view import draw
 
-    from . import demo, metrics
+    from . import demo, kernels, metrics
     from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
     from .geometry import geodesics
     from .sim import memory
+
+    __version__: str
 
 __all__ = [
     "BodyMotion",
@@ -31,13 +34,16 @@ __all__ = [
     "MissingExtra",
     "NetworkConfig",
     "NotEnoughMemory",
+    "PatchTransformer",
     "RolloutStatus",
     "Simulator",
     "Verdict",
+    "__version__",
     "demo",
     "draw",
     "fit",
     "geodesics",
+    "kernels",
     "memory",
     "metrics",
 ]
@@ -53,6 +59,7 @@ _HOME = {
     "MissingExtra": "errors",
     "NetworkConfig": "nn.config",
     "NotEnoughMemory": "errors",
+    "PatchTransformer": "nn.patches.network",
     "RolloutStatus": "objects.status",
     "Simulator": "sim.simulator",
     "Verdict": "objects.status",
@@ -62,6 +69,7 @@ _MODULES = {
     "demo": "demo",
     "draw": "view.draw",
     "geodesics": "geometry.geodesics",
+    "kernels": "kernels",
     "memory": "sim.memory",
     "metrics": "metrics",
 }
@@ -70,8 +78,14 @@ _MODULES = {
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = importlib.import_module(f".{_HOME.get(name) or _MODULES[name]}", __name__)
-    value = getattr(home, name) if name in _HOME else home
+    value: Any
+    if name == "__version__":  # of what is installed
+        from importlib.metadata import version
+
+        value = version(__name__)
+    else:
+        home = importlib.import_module(f".{_HOME.get(name) or _MODULES[name]}", __name__)
+        value = getattr(home, name) if name in _HOME else home
     globals()[name] = value
     return value
 

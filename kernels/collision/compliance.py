@@ -48,8 +48,12 @@ class Compliance(NamedTuple):
     """int64 [C], where the scratch of a component begins; components never share it."""
     wide: torch.Tensor
     """int32 [C], where a component begins among vertices in panels of sixteen, the last of each padded."""
-    sizes: torch.Tensor
-    """int64 [3] on the host: entries of the scratch, components with a block, panels of vertices."""
+    scratch: int
+    """Entries of the scratch of all components."""
+    inverted: int
+    """Components with a block."""
+    panels: int
+    """Panels of vertices."""
     local: torch.Tensor
     """int32 [V], index of a vertex within its component."""
     values: torch.Tensor
@@ -81,8 +85,8 @@ class Compliance(NamedTuple):
         values = torch.cat(blocks) if blocks else torch.empty(0, dtype=torch.float32, device=device)
         panels = np.concatenate([[0], np.cumsum(_pitch(sizes) // 16)])
         device_side = (torch.from_numpy(a).to(device) for a in (base, room, panels[:-1].astype(np.int32)))
-        counts = torch.tensor([needed, int((base >= 0).sum()), int(panels[-1])])
-        return cls._make((*device_side, counts, torch.from_numpy(local).to(device), values))
+        counts = int(needed), int((base >= 0).sum()), int(panels[-1])
+        return cls(*device_side, *counts, torch.from_numpy(local).to(device), values)
 
 
 def _pitch(size: int | np.ndarray) -> int | np.ndarray:

@@ -197,7 +197,7 @@ def solve(
     Returns:
         Forces y, float64 [V].
     """
-    places, device = int(factor.counts[3]), normal.device
+    places, device = factor.places, normal.device
     integers = allocate((3, places), torch.int32, device)
     scalars, vectors = allocate((4, places), torch.float64, device), allocate((2, places, 4), torch.float64, device)
     force = torch.zeros(len(normal), dtype=torch.float64, device=device)

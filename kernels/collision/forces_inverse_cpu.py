@@ -203,10 +203,10 @@ def solve(
 ) -> torch.Tensor:
     """Forces y, float64 [V], of the components with a compliance matrix. Arguments: as `contact_forces.solve`."""
     vertices, device = len(normal), normal.device
-    panels = int(model.sizes[2])
-    coupling = allocate((int(model.sizes[0]),), torch.float32, device)
-    place = allocate((16 * panels,), torch.int32, device)
-    wide, scalars = allocate((4, 16 * panels), torch.float32, device), allocate((3, vertices), torch.float64, device)
+    coupling = allocate((model.scratch,), torch.float32, device)
+    place = allocate((16 * model.panels,), torch.int32, device)
+    wide = allocate((4, 16 * model.panels), torch.float32, device)
+    scalars = allocate((3, vertices), torch.float64, device)
     force = torch.zeros(vertices, dtype=torch.float64, device=device)
 
     def of_16(tensor: torch.Tensor) -> object:

@@ -225,7 +225,7 @@ def solve(
     """Contact forces y, float64 [V], zero without contact. Writes iterations and error of the components it solves."""
     end, contacts = listed
     vertices, count = len(normal), len(model.base)
-    coupling = allocate((int(model.sizes[0]),), torch.float32, normal.device)
+    coupling = allocate((model.scratch,), torch.float32, normal.device)
     work = allocate((3, vertices), torch.float64, normal.device)
     force = torch.zeros(vertices, dtype=torch.float64, device=normal.device)
     with torch_stream(normal.device) as device:

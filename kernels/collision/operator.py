@@ -12,6 +12,8 @@ Each component is solved in the first of these ways that its solver was built fo
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
 
@@ -19,7 +21,7 @@ from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
-from warpgarment.kernels.operator import allocate
+from warpgarment.kernels.operator import allocate, unpack
 
 from . import forces_factor_cpu, forces_inverse_cpu, forces_inverse_gpu
 from .body_contacts import contact_gap
@@ -35,25 +37,20 @@ The residual is a bound, and the error in the energy norm a small part of it. Me
 """
 
 
-Parts = tuple[System, Compliance, Factor, torch.Tensor, bool]
+class Model(NamedTuple):
+    """What is constant of a solver; it travels through the operators as one list (`operator.pack`)."""
 
-
-def model_of(
-    system: System, dense: Compliance, factor: Factor, vertex_component: torch.Tensor, one_core: bool
-) -> list[torch.Tensor]:
-    """The tensors of a solver, which travel through the operators as one list."""
-    return [*system, *dense, *factor, vertex_component, torch.tensor(one_core)]
-
-
-def _parts(model: list[torch.Tensor]) -> Parts:
-    ends = [len(kind._fields) for kind in (System, Compliance, Factor)]
-    first, second, third = ends[0], ends[0] + ends[1], sum(ends)
-    system, dense, factor = System(*model[:first]), Compliance(*model[first:second]), Factor(*model[second:third])
-    return system, dense, factor, model[third], bool(model[third + 1])
+    system: System
+    dense: Compliance
+    factor: Factor
+    vertex_component: torch.Tensor
+    """int32 [V]."""
+    one_core: bool
+    """Whether solves are laid out for one CPU core."""
 
 
 def _solve(
-    parts: Parts,
+    model: Model,
     normal: torch.Tensor,
     gap: torch.Tensor,
     tolerance: torch.Tensor,
@@ -66,13 +63,12 @@ def _solve(
     Returns:
         D float64 [V,3] (not where a load is given), forces float64 [V], iterations int32 [C], error float64 [C].
     """
-    system, dense, factor, vertex_component, one_core = parts
+    system, dense, factor, vertex_component, one_core = model
     count, device = len(tolerance), normal.device
     force = torch.zeros(len(normal), dtype=torch.float64, device=device)
-    inverted, factored = int(dense.sizes[1]), int(factor.counts[0])
-    if inverted + factored < count:
+    if dense.inverted + factor.factored < count:
         right = normal * gap[:, None] if load is None else load
-        if inverted + factored:  # the others' loads are zero, which takes no iterations
+        if dense.inverted + factor.factored:  # the others' loads are zero, which takes no iterations
             left = (dense.base < 0) & (factor.base < 0)
             right = right * left[vertex_component.long(), None]
         increment, report, error = conjugate_gradients.solve(system, normal, right, tolerance, relative, max_iterations)
@@ -82,15 +78,15 @@ def _solve(
         report, error = (allocate((count,), dtype, device) for dtype in (torch.int32, torch.float64))
     results = increment, report, error
     limit = RESIDUAL * tolerance
-    if inverted and one_core:
+    if dense.inverted and one_core:
         force += forces_inverse_cpu.solve(system, dense, normal, gap, limit, relative, max_iterations, *results)
-    elif inverted:
+    elif dense.inverted:
         listed = forces_inverse_gpu.list_contacts(system, normal)
         y = forces_inverse_gpu.solve(system, dense, listed, normal, gap, limit, relative, max_iterations, report, error)
         if load is None:
             forces_inverse_gpu.displace(system, dense, vertex_component, listed, normal, y, increment)
         force += y
-    if factored:
+    if factor.factored:
         force += forces_factor_cpu.solve(system, factor, normal, gap, limit, relative, max_iterations, *results)
     return increment, force, report, error
 
@@ -121,7 +117,7 @@ def collision_solve(
             ],
             device=device,
         )
-    increment, _, report, error = _solve(_parts(model), normal, gap, tolerance, 0.0, max_iterations)
+    increment, _, report, error = _solve(unpack(model, Model), normal, gap, tolerance, 0.0, max_iterations)
     return (vertices.double() + increment).to(torch.float32), report, error
 
 
@@ -141,11 +137,12 @@ def collision_solve_backward(
 ) -> torch.Tensor:
     """g - n (n·λ) with A λ = g; n·λ is the force that the gap n·(B⁻¹ g) would cause."""
     normal, g = normal.contiguous(), grad.double().contiguous()
-    parts = system, dense, factor, vertex_component, _ = _parts(model)
+    parts = unpack(model, Model)
+    system, dense, factor, vertex_component, _ = parts
     gap = torch.zeros(len(g), dtype=torch.float64, device=g.device)
-    if int(dense.sizes[1]):
+    if dense.inverted:
         gap = forces_inverse_gpu.respond(system, dense, vertex_component, normal, g)
-    if int(factor.counts[0]):
+    if factor.factored:
         response = torch.zeros_like(g)
         triangular.solve(system, factor, vertex_component, g, response)
         gap += (normal * response).sum(1)

@@ -38,12 +38,13 @@ from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.progress import Progress
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.mesh.laplacian import as_numpy, components, cotangent_laplacian
+from warpgarment.kernels.operator import pack
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from . import compliance
 from .body_contacts import contacts
 from .compliance import Compliance
-from .operator import model_of
+from .operator import Model
 
 TOLERANCE = 2e-6
 """Error of a solve in the energy norm [m].
@@ -103,7 +104,7 @@ class CollisionSolver:
         dense = Compliance.build(base.tocsr(), system, largest_compliance, compliance_budget)
         budget = factor_budget if one_core else 0
         factors = Factor.build(base.tocsr(), system, explicit=False, budget=budget, skip=dense.base.cpu().numpy() >= 0)
-        self._model = model_of(system, dense, factors, torch.from_numpy(vertex_component).to(device), one_core)
+        self._model = pack(Model(system, dense, factors, torch.from_numpy(vertex_component).to(device), one_core))
         self._progress = Progress("CollisionSolver")
         self._contacts: torch.Tensor | None = None
         self.vertex_count = vertex_count

@@ -69,8 +69,14 @@ class Factor(NamedTuple):
     row_column: torch.Tensor
     row_value: torch.Tensor
     """int32, int32 and float64; the last three are empty in the form for substitution."""
-    counts: torch.Tensor
-    """int64 [4] on the host: components with a factor, components without, 1 if explicit, places of all components."""
+    factored: int
+    """Components with a factor."""
+    unfactored: int
+    """Components without."""
+    explicit: bool
+    """The form of the factors."""
+    places: int
+    """Places of all components."""
 
     @classmethod
     def build(
@@ -114,13 +120,13 @@ class Factor(NamedTuple):
         order, pivot, triangle = (np.concatenate([p[i] for p in parts] or [empty[i]]) for i in range(3))
         triangles = [_stacked([p[i] for p in parts if len(p) > i]) for i in (3, 4)]
         host = (base, ends[:-1].astype(np.int32), order.astype(np.int32), pivot.astype(np.float64), triangle)
-        counts = torch.tensor([int((base >= 0).sum()), int((base < 0).sum()), int(explicit), int(ends[-1])])
+        counts = int((base >= 0).sum()), int((base < 0).sum()), explicit, int(ends[-1])
         arrays = (*host, *triangles[0], *triangles[1])
-        return cls._make((*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays), counts))
+        return cls(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays), *counts)
 
     def without(self, load: torch.Tensor, vertex_component: torch.Tensor) -> torch.Tensor:
         """A load [V,3] with zeros on the components that have a factor."""
-        return load * (self.base < 0)[vertex_component.long(), None] if int(self.counts[0]) else load
+        return load * (self.base < 0)[vertex_component.long(), None] if self.factored else load
 
 
 def component_blocks(

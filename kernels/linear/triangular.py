@@ -229,13 +229,13 @@ def solve(
         rhs: b, float64 [V,3].
         solution: x, float64 [V,3]; rows of other components are not touched.
     """
-    if len(rhs) == 0 or not int(factor.counts[0]):
+    if len(rhs) == 0 or not factor.factored:
         return
     common = [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32)]
     load, result = as_argument(rhs, wp.vec3d), as_argument(solution, wp.vec3d)
     with torch_stream(rhs.device) as device:
-        if not int(factor.counts[2]):
-            scratch = allocate((int(factor.counts[3]), 4), torch.float64, rhs.device)
+        if not factor.explicit:
+            scratch = allocate((factor.places, 4), torch.float64, rhs.device)
             inputs = [*common, *substitution(factor), load, as_argument(scratch, wp.vec4d), result]
             wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
             return

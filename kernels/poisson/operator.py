@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
 
@@ -9,7 +11,7 @@ from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System, block_dim
-from warpgarment.kernels.operator import allocate
+from warpgarment.kernels.operator import allocate, unpack
 
 from .kernels import phi_adjoint, place, place_adjoint, right_hand_side
 
@@ -17,6 +19,7 @@ ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
 
 # The tensors of a solver travel through the operators as one list, in this order; System and Factor follow.
+# The tensors of a solver travel through the operators as one list, in this order; `Matrix` follows.
 MODEL = (
     ("rest_vertices", wp.vec3),
     ("faces", wp.int32),
@@ -34,17 +37,23 @@ MODEL = (
     ("no_normal", wp.vec3d),
     ("tolerance", None),
 )
-_SYSTEM = len(MODEL)
-_FACTOR = _SYSTEM + len(System._fields)
+
+
+class Matrix(NamedTuple):
+    """The matrix of a solver."""
+
+    system: System
+    factor: Factor
 
 
 def _views(model: list[torch.Tensor]) -> dict[str, object]:
-    names = zip(MODEL, model[:_SYSTEM], strict=True)
-    return {name: as_argument(tensor, dtype) for (name, dtype), tensor in names if dtype is not None}
+    tensors = _named(model)
+    return {name: as_argument(tensors[name], dtype) for name, dtype in MODEL if dtype is not None}
 
 
 def _start_rows(model: list[torch.Tensor]) -> list[object]:
-    return [as_argument(tensor, wp.int32) for tensor in model[_SYSTEM : _SYSTEM + 2]]
+    system = matrix_of(model).system
+    return [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32)]
 
 
 def _solve(
@@ -52,9 +61,9 @@ def _solve(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """(L + W) D = g: directly where there is a factor, or else as `conjugate_gradients.solve`, which says what is
     returned."""
-    system, factor = System(*model[_SYSTEM:_FACTOR]), Factor(*model[_FACTOR:])
+    system, factor = matrix_of(model)
     tensors = _named(model)
-    if int(factor.counts[1]):
+    if factor.unfactored:
         load = factor.without(rhs, tensors["vertex_component"])
         solution, report, error = conjugate_gradients.solve(
             system, tensors["no_normal"], load, tolerance, relative, max_iterations
@@ -67,7 +76,12 @@ def _solve(
 
 
 def _named(model: list[torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {name: tensor for (name, _), tensor in zip(MODEL, model[:_SYSTEM], strict=True)}
+    return {name: tensor for (name, _), tensor in zip(MODEL, model[: len(MODEL)], strict=True)}
+
+
+def matrix_of(model: list[torch.Tensor]) -> Matrix:
+    """The matrix among the tensors of a solver."""
+    return unpack(model[len(MODEL) :], Matrix)
 
 
 @torch.library.custom_op("warpgarment::poisson_solve", mutates_args=())

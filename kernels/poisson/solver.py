@@ -38,9 +38,10 @@ from warpgarment.kernels.linear import factor
 from warpgarment.kernels.linear.progress import Progress
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.mesh.laplacian import as_numpy, components, cotangent_laplacian, half_cotangents
+from warpgarment.kernels.operator import pack
 
 from .kernels import FREE, ISOLATED, PINNED
-from .operator import MODEL
+from .operator import MODEL, Matrix
 
 TOLERANCE = 3e-7
 """Error of conjugate gradients in the energy norm as a share of the rest bounding box diagonal.
@@ -137,7 +138,7 @@ class PoissonSolver:
         explicit = device.type != "cpu" if explicit is None else explicit
         grounded = (matrix + scipy.sparse.diags(_ground(matrix, vertex_component, kind))).tocsr()
         factors = factor.Factor.build(grounded, system, explicit=explicit, budget=factor_budget)
-        self._model = [*(tensors[name] for name, _ in MODEL), *system, *factors]
+        self._model = [*(tensors[name] for name, _ in MODEL), *pack(Matrix(system, factors))]
         self._progress = Progress("PoissonSolver")
         self.rest_vertices, self.faces = tensors["rest_vertices"], tensors["faces"]
         self.pins = tensors["pins"]

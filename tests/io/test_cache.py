@@ -78,6 +78,22 @@ def test_damaged_and_foreign_files_are_written_again(folder, damage):
     assert compute.calls == 2
 
 
+def test_a_flipped_bit_anywhere_is_noticed(folder):
+    """One bit of the file is another, in its header, its checksum or its numbers, and other distances come out. Every
+    bit of a file in turn."""
+    ask(Counted())
+    (path,) = folder.iterdir()
+    whole, noticed = path.read_bytes(), 0
+    for bit in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        found = cache._read(path, EXPECTED)
+        noticed += found is None
+        assert found is None or np.array_equal(found["a"], [[0, 1], [2, 3], [4, 5]]), f"bit {bit}"
+    assert noticed >= 8 * 24, "every bit of the numbers, at least"
+
+
 def test_writers_at_the_same_time(folder):
     """Two processes would leave half a file each: all compute at once, and one whole file is left."""
     gate, compute = threading.Barrier(8), Counted()

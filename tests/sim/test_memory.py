@@ -12,8 +12,9 @@ from support.scenes import network, skirt, tube, walk
 
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
-from warpgarment.kernels.collision.operator import _parts as parts
-from warpgarment.kernels.linear.factor import Factor
+from warpgarment.kernels.collision.operator import Model
+from warpgarment.kernels.operator import pack, unpack
+from warpgarment.kernels.poisson.operator import matrix_of
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import build_network
@@ -58,7 +59,8 @@ def pooled(around: int, along: int) -> Garment:
 
 def factor_of(solver) -> list[torch.Tensor]:
     """The factor among what a solver's operator is given, found as the solver itself finds it."""
-    return list(solver._model[-len(Factor._fields) :]) if isinstance(solver, PoissonSolver) else parts(solver._model)[2]
+    model = solver._model
+    return pack((matrix_of(model) if isinstance(solver, PoissonSolver) else unpack(model, Model)).factor)
 
 
 SMALL, BASE, FAST = (kind(layers=1) for kind in (NetworkConfig.small, NetworkConfig.base, NetworkConfig.fast))

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpgarment.view import markdown
+
 from .layout import SPLITS
 from .set_manifest import planned_numbers
 
@@ -169,5 +171,4 @@ def credits(facts: Facts) -> list[str]:
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
     """A Markdown table, followed by an empty line."""
-    lines = [header, ["---", *(["---:"] * (len(header) - 1))], *rows]
-    return [*("| " + " | ".join(map(str, line)) + " |" for line in lines), ""]
+    return [*markdown.table(header, rows), ""]

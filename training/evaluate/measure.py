@@ -15,8 +15,6 @@ the same way, with `measure`.
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ import numpy as np
 import tyro
 
 from warpgarment.errors import MissingExtra
+from warpgarment.io.atomic import atomic_file
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.tables.options import OptionMissing, TableName, TableOptions
@@ -39,6 +38,7 @@ from warpgarment.training.tables.protocol import (
     plain,
     skipped_lines,
 )
+from warpgarment.training.tables.report import grid
 from warpgarment.training.train.training_set import folders_of
 
 
@@ -140,11 +140,13 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
 
 def write(out: Path, result: dict[str, Any], curves: dict[tuple[str, str], list[np.ndarray]], *, picture: bool) -> None:
     """Writes the result files, each under another name first."""
-    out.mkdir(parents=True, exist_ok=True)
-    _replace(out / "evaluation.json", lambda path: path.write_text(json.dumps(plain(result), indent=1), "utf-8"))
-    _replace(out / "evaluation.md", lambda path: path.write_text(table(result), "utf-8"))
+    with atomic_file(out / "evaluation.json") as path:
+        path.write_text(json.dumps(plain(result), indent=1), "utf-8")
+    with atomic_file(out / "evaluation.md") as path:
+        path.write_text(table(result), "utf-8")
     if picture:
-        _replace(out / "error_over_time.png", lambda path: draw(path, curves))
+        with atomic_file(out / "error_over_time.png") as path:
+            draw(path, curves)
 
 
 def table(result: dict[str, Any]) -> str:
@@ -160,15 +162,17 @@ def table(result: dict[str, Any]) -> str:
         "",
     ]
     headings = [heading for heading, _ in FIGURES.values()]
-    lines += _row(["start", "method", *headings, "failed"]), _row(["---"] * (len(headings) + 3))
+    rows: list[list[str]] = []
     for start, methods in result["mean"].items():
-        lines += [_row([start, method, *cells(f), str(f["failed"])]) for method, f in methods.items()]
-    lines += ["", _row(["sequence", "start", "frames", "method", *headings]), _row(["---"] * (len(headings) + 4))]
+        rows += [[start, method, *cells(f), str(f["failed"])] for method, f in methods.items()]
+    lines += [*grid(["start", "method", *headings, "failed"], rows), ""]
+    rows = []
     for row in result["sequences"]:
         for method in METHODS:
             if method in row:
-                lines.append(_row([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])]))
-    lines += ["", *skipped_lines(result["skipped"])]
+                rows.append([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])])
+    lines += [*grid(["sequence", "start", "frames", "method", *headings], rows), ""]
+    lines += skipped_lines(result["skipped"])
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -199,19 +203,6 @@ def draw(path: Path, curves: dict[tuple[str, str], list[np.ndarray]]) -> None:
 def _describe(path: Path, simulator: Simulator) -> dict[str, Any]:
     _, notes = checkpoint.read_metadata(path)
     return {"file": path.name, "config": vars(simulator.network.config), "notes": notes}
-
-
-def _row(cells: list[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _replace(path: Path, make: Callable[[Path], Any]) -> None:
-    temporary = path.with_name(f".{path.name}.partial")
-    try:
-        make(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _pyplot():

@@ -9,7 +9,8 @@ array
     geodesics.npy     float32 [F, F]         metres, inf across components; garments beyond 10,000 faces have none
 
 in a folder named after the sequence and the checksum of everything that went in (array files, versions). A folder is
-written under another name and renamed when complete, so that what exists is whole.
+written under another name and renamed when complete, and its manifest holds the checksums of its files: one that was
+damaged since counts as missing.
 
     python -m warpgarment.training.samples.interactions DATA [CACHE]        # fills the cache before a training run
 """
@@ -18,21 +19,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import sys
-import tempfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 import torch
 
 import warpgarment
+from warpgarment.io.atomic import atomic_folder
 from warpgarment.kernels.deformation.gradients import face_centroids
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
+MANIFEST = "manifest.json"
 WIDTH = 16
 COLUMNS: dict[str, int | slice] = {
     "closest": slice(0, 3),
@@ -62,7 +64,7 @@ def default_cache(data: Path) -> Path:
 
 def key_of(folder: Path) -> str:
     """Checksum of the arrays and versions that the cached values depend on."""
-    digest = hashlib.sha256(f"{CACHE_VERSION} {getattr(warpgarment, '__version__', '')}".encode())
+    digest = hashlib.sha256(f"{CACHE_VERSION} {warpgarment.__version__}".encode())
     for name in _SOURCES:
         path = Path(folder) / f"{name}.npy"
         digest.update(name.encode())
@@ -140,30 +142,42 @@ def cached(
     """
     cache = Path(cache)
     place = cache / f"{Path(folder).name}-{key_of(folder)}"
-    if not (place / "manifest.json").exists():
+    names = ["interaction.npy"] if sequence.garment.pools else ["interaction.npy", "geodesics.npy"]
+    if not _whole(place, names):
+        shutil.rmtree(place, ignore_errors=True)  # so that no process finds it in its way when it has computed
         interaction = compute(sequence, device)
         if not np.isfinite(interaction).all():
             raise UnusableSequence("body interaction is not finite (degenerate body faces or NaN in the body motion)")
-        cache.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=".writing-", dir=cache))
-        try:
+        with atomic_folder(place, "*", stays=lambda found: _whole(found, names)) as temporary:
             np.save(temporary / "interaction.npy", interaction)
             if not sequence.garment.pools:
                 np.save(temporary / "geodesics.npy", np.asarray(sequence.garment.geodesics, np.float32))
-            manifest = {"cache_version": CACHE_VERSION, "device": str(device)}
-            (temporary / "manifest.json").write_text(json.dumps(manifest))
-            try:
-                os.replace(temporary, place)
-            except OSError:  # another process was first, or what lies there is incomplete
-                if not (place / "manifest.json").exists():
-                    shutil.rmtree(place)
-                    os.replace(temporary, place)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+            (temporary / MANIFEST).write_text(_manifest(temporary), "utf-8")
     interaction = np.load(place / "interaction.npy", mmap_mode="r")
     if sequence.garment.pools:
         return interaction, None
     return interaction, np.load(place / "geodesics.npy", mmap_mode="r")
+
+
+def _manifest(place: Path) -> str:
+    """Text of the manifest of a complete folder: the checksum of each of its arrays' files, headers included."""
+    sums = {}
+    for path in sorted(place.glob("*.npy")):
+        value = 0
+        with path.open("rb") as file:
+            while block := file.read(2**20):
+                value = zlib.crc32(block, value)
+        sums[path.name] = f"{value:08x}"
+    return json.dumps({"cache_version": CACHE_VERSION, "crc32": sums})
+
+
+def _whole(place: Path, names: list[str]) -> bool:
+    """Whether a folder has these files, and no bit of it is another than was written."""
+    try:
+        manifest = (place / MANIFEST).read_text("utf-8")
+        return all((place / name).exists() for name in names) and manifest == _manifest(place)
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def main(arguments: list[str]) -> None:

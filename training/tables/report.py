@@ -13,6 +13,7 @@ import torch
 
 from warpgarment.io.atomic import atomic_file
 from warpgarment.training.data.set_manifest import package_versions
+from warpgarment.view.markdown import table
 
 from .options import RESULTS
 from .protocol import FIGURES, STARTS, cells, plain, skipped_lines
@@ -60,8 +61,8 @@ def publish(config: Any, result: dict[str, Any], body: list[str], draw: Callable
 
 
 def grid(headings: list[str], rows: list[list[str]]) -> list[str]:
-    """A Markdown table."""
-    return ["| " + " | ".join(cells) + " |" for cells in (headings, ["---"] * len(headings), *rows)]
+    """A Markdown table, all of whose columns are aligned to the left."""
+    return table(headings, rows, text=len(headings))
 
 
 def means_table(rows: list[dict[str, Any]], extra: dict[str, str] | None = None) -> list[str]:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 
@@ -63,8 +63,17 @@ def atomic_file(path: Path) -> Iterator[Path]:
         yield temporary
 
 
+def _moved(source: Path, target: Path) -> bool:
+    """Whether a folder could be renamed: not to the name of one that holds something."""
+    try:
+        os.replace(source, target)
+    except OSError:
+        return False
+    return True
+
+
 @contextlib.contextmanager
-def atomic_folder(path: Path, replaces: str) -> Iterator[Path]:
+def atomic_folder(path: Path, replaces: str, stays: Callable[[Path], bool] | None = None) -> Iterator[Path]:
     """Yields a temporary folder that takes the target's place on success and vanishes on any error.
 
     An old folder is moved aside first and put back should the last rename fail.
@@ -72,6 +81,8 @@ def atomic_folder(path: Path, replaces: str) -> Iterator[Path]:
     Args:
         path: Where the folder shall appear.
         replaces: Glob pattern; an existing folder is replaced only if each of its files matches.
+        stays: Whether a folder that is there when the temporary one is complete is kept instead of it. Then the first
+            of several processes that write the same folder wins, and those who read it already keep their files.
 
     Raises:
         FileExistsError: The folder holds something else, or a file has its name.
@@ -93,14 +104,15 @@ def atomic_folder(path: Path, replaces: str) -> Iterator[Path]:
         yield temporary
         for item in temporary.iterdir():
             _flush(item)
-        if path.exists():
-            os.replace(path, old)
-        try:
-            os.replace(temporary, path)
-        except OSError:
-            if old.exists():
-                os.replace(old, path)
-            raise
+        if stays is None or not (_moved(temporary, path) or stays(path)):
+            if path.exists():
+                os.replace(path, old)
+            try:
+                os.replace(temporary, path)
+            except OSError:
+                if old.exists():
+                    os.replace(old, path)
+                raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)

@@ -19,7 +19,7 @@ import torch
 
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
-from warpgarment.kernels.collision import compliance
+from warpgarment.kernels.collision.solver import compliance
 from warpgarment.kernels.features.face import FEATURES
 from warpgarment.kernels.linear import factor
 from warpgarment.nn.config import NetworkConfig

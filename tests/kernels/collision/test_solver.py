@@ -12,7 +12,8 @@ from support.poison import poison_outputs
 
 from warpgarment.kernels import collision
 from warpgarment.kernels.collision import compliance
-from warpgarment.kernels.linear import conjugate_gradients
+from warpgarment.kernels.collision.operator import Model
+from warpgarment.kernels.operator import unpack
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 EPSILON = 0.004
@@ -158,7 +159,7 @@ def test_packed_batch_is_the_garments_one_by_one(one_core):
 
 def inverted(solver: collision.CollisionSolver) -> list[int]:
     """Where the inverse of each component begins; -1 without one."""
-    return solver._model[len(conjugate_gradients.System._fields)].tolist()
+    return unpack(solver._model, Model).dense.base.tolist()
 
 
 def test_budgets_are_kept():
@@ -170,7 +171,7 @@ def test_budgets_are_kept():
     for factors in (2**20, 0):
         solver = solver_for(both, compliance_budget=entries, factor_budget=factors)
         assert inverted(solver) == [0, -1]
-        assert len(solver._model[11]) == entries
+        assert len(unpack(solver._model, Model).dense.values) == entries
         result = solver.refine(torch.tensor(both.vertices), body_of(ellipsoid()))
         np.testing.assert_allclose(result, expected, atol=TOLERANCE)
 

@@ -15,6 +15,7 @@ from support.poison import poison_outputs
 
 from warpgarment.kernels.linear import conjugate_gradients, factor
 from warpgarment.kernels.mesh import laplacian
+from warpgarment.kernels.poisson.operator import matrix_of
 from warpgarment.kernels.poisson.solver import PoissonSolver
 
 GARMENTS = {
@@ -339,8 +340,7 @@ def test_factor_is_that_of_the_matrix(flat):
 
 
 def _factor(solver: PoissonSolver) -> dict[str, torch.Tensor]:
-    fields = factor.Factor._fields
-    return dict(zip(fields, solver._model[-len(fields) :], strict=True))
+    return matrix_of(solver._model).factor._asdict()
 
 
 @pytest.mark.parametrize(

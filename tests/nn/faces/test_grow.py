@@ -7,7 +7,7 @@ import torch
 from support import sequences as synthetic_sequences
 from support.runs import config_for
 
-from warpgarment import checkpoint
+from warpgarment.nn import checkpoint
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.grow import GrowthError, grow

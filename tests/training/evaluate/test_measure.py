@@ -123,6 +123,25 @@ def test_files_are_written(evaluated):
     assert (config.out / "error_over_time.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+def test_two_evaluations_into_one_folder(evaluated, tmp_path, monkeypatch):
+    """The second evaluation into a folder takes the half-written file of the first, which then fails."""
+    _, result = evaluated
+    curves = {("network", start): [np.ones(3)] for start in ("warm", "cold")}
+    drawn, draw = [], evaluate.draw
+
+    def twice(path, curves):
+        draw(path, curves)
+        drawn.append(path)
+        if len(drawn) == 1:
+            evaluate.write(tmp_path / "out", result, curves, picture=True)
+
+    monkeypatch.setattr(evaluate, "draw", twice)
+    evaluate.write(tmp_path / "out", result, curves, picture=True)
+    assert len(drawn) == 2
+    names = sorted(p.name for p in (tmp_path / "out").iterdir())
+    assert names == ["error_over_time.png", "evaluation.json", "evaluation.md"]
+
+
 def test_nothing_to_evaluate_is_said(evaluated, tmp_path):
     """An empty folder would give a table of nothing."""
     config, _ = evaluated

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
+import typing
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,7 @@ from warpgarment.training.samples.augmentation import Augmentation, mirror
 from warpgarment.training.samples.noise import NoiseBasis, NoiseConfig
 from warpgarment.training.samples.recorded import SequenceData
 from warpgarment.training.samples.single_step import SampleBuilder
+from warpgarment.training.train import losses
 from warpgarment.training.train.losses import LossConfig, loss
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.1, geodesic_radius=0.2)
@@ -223,6 +226,14 @@ def test_loss_is_the_weighted_sum_of_absolute_differences():
     assert float(loss(a, b, network, LossConfig(), mask).total) == pytest.approx(expected, rel=1e-5)
     physical = 0.1 * parts[0].sum(-1).mean() + parts[1].sum(-1).mean() + 3 * 0.01 * velocity
     assert float(loss(a, b, network, LossConfig(units="physical"), mask).total) == pytest.approx(physical, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "name", [n for n, f in inspect.getmembers(losses, inspect.isfunction) if f.__module__ == losses.__name__]
+)
+def test_types_of_losses_can_be_looked_up(name):
+    """A function's types name something that the file does not import: whoever asks for them gets a NameError."""
+    assert "return" in typing.get_type_hints(getattr(losses, name))
 
 
 def _nothing(network):

@@ -1,0 +1,80 @@
+"""Tables in Markdown: as they were written before, character by character."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import report, teacher, teachers_side_by_side
+from warpgarment.training.data import card_page
+from warpgarment.training.evaluate import measure as evaluate
+from warpgarment.training.tables.report import grid, means_table
+from warpgarment.view.markdown import table
+
+RESULTS = Path(report.__file__).parent / "results"
+
+
+def recorded(name: str) -> tuple[dict, str]:
+    """A published result and the page that was written of it."""
+    return json.loads((RESULTS / f"{name}.json").read_text("utf-8")), (RESULTS / f"{name}.md").read_text("utf-8")
+
+
+def test_columns_are_aligned_as_asked():
+    """Numbers stand at the left, or words at the right; by hand."""
+    rows = [["a", 1, 0.5], ["b", "2", ""]]
+    assert table(["", "n", "x"], rows) == ["|  | n | x |", "| --- | ---: | ---: |", "| a | 1 | 0.5 |", "| b | 2 |  |"]
+    assert table(["", "n", "x"], rows, text=3)[1] == grid(["", "n", "x"], [])[1] == "| --- | --- | --- |"
+    assert table(["", "n", "x"], iter(rows), text=0)[1] == "| ---: | ---: | ---: |"
+    assert table(("n", "x", "what"), [], text=("what", "other"))[1] == "| ---: | ---: | --- |"
+    assert card_page.table(["a", "b"], {"k": 1}.items()) == ["| a | b |", "| --- | ---: |", "| k | 1 |", ""]
+
+
+def test_rows_have_a_cell_for_each_column():
+    """A cell is missing and all that follow stand under the heading of another."""
+    with pytest.raises(ValueError, match="a row of 1 cells in a table of 2 columns: \\['x'\\]"):
+        table(["a", "b"], [["x"]])
+
+
+@pytest.mark.parametrize("name", ["evaluation_fast", "evaluation_small"])
+def test_evaluations_are_written_as_published(name):
+    """The page of an evaluation reads otherwise than the published one of the same figures."""
+    result, page = recorded(name)
+    assert evaluate.table(result) == page
+
+
+def test_benchmarks_are_written_as_published():
+    """The page of the benchmarks, all parts of it, reads otherwise than the published one of the same rows."""
+    result, page = recorded("cpu")
+    written = report.markdown(result["machine"], result["command"], result["rows"])
+    assert {row["part"] for row in result["rows"]} == set(report.TITLES)
+    assert written == page
+
+
+@pytest.mark.parametrize("name", ["newton", "blender"])
+def test_teachers_are_written_as_published(name):
+    """The page of a teacher's times reads otherwise than the published one of the same rows."""
+    result, page = recorded(f"teacher_{name}_cpu")
+    assert teacher.markdown(result["machine"], result["command"], result["rows"]) == page
+
+
+def test_teachers_side_by_side_are_written_as_published():
+    """The page that compares teachers reads otherwise than the published one of the same rows."""
+    result, page = recorded("teachers")
+    written = teachers_side_by_side.markdown(result["machine"], result["rows"], result["checks"], result["frames"])
+    assert written == page
+
+
+@pytest.mark.parametrize(
+    ("name", "extra"),
+    [
+        ("table1", {"steps": "steps", "hours": "hours"}),
+        ("table1_fast", {"steps": "steps", "hours": "hours"}),
+        ("figure12", {"count": "sequences"}),
+    ],
+)
+def test_tables_are_written_as_published(name, extra):
+    """A table of the paper reads otherwise than the published one of the same rows."""
+    result, page = recorded(name)
+    assert "\n".join(means_table(result["rows"], extra)) in page

@@ -1,0 +1,28 @@
+"""Tables in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any
+
+
+def table(header: Sequence[Any], rows: Iterable[Sequence[Any]], text: int | Collection[str] = 1) -> list[str]:
+    """Lines of a table; columns of numbers are aligned to the right.
+
+    Args:
+        header: Headings of the columns.
+        rows: Cells of each row, one for each heading; written by `str`.
+        text: Columns aligned to the left: the number of leading ones, or their headings.
+
+    Raises:
+        ValueError: A row has another number of cells than the header.
+    """
+    if isinstance(text, int):
+        left = [i < text for i in range(len(header))]
+    else:
+        left = [name in text for name in header]
+    lines = [header, ["---" if of_text else "---:" for of_text in left], *rows]
+    for line in lines:
+        if len(line) != len(header):
+            raise ValueError(f"a row of {len(line)} cells in a table of {len(header)} columns: {list(line)}")
+    return ["| " + " | ".join(map(str, line)) + " |" for line in lines]
