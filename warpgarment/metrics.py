@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from warpgarment.geometry.checks import check_edges, checked_faces, to_numpy
 from warpgarment.geometry.geodesics import distances_from, surface_graph
+from warpgarment.geometry.orientation import turned_outward
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 
@@ -106,7 +107,7 @@ def body_collision(vertices: Any, body_vertices: Any, body_faces: Any) -> float:
     Args:
         vertices: Garment positions [m], shape [V,3] or [T,V,3].
         body_vertices: Body positions [m], shape [U,3] or [T,U,3]; a single frame serves all.
-        body_faces: Vertex indices, counter-clockwise seen from outside, shape [G,3].
+        body_faces: Vertex indices, shape [G,3]; faces that look inwards are turned round, with a warning.
 
     Raises:
         ValueError: Other shapes, or indices out of range.
@@ -197,6 +198,7 @@ def _body_distance(vertices: Any, body_vertices: Any, body_faces: Any) -> np.nda
     points, body = _same_frames(points, body, "vertices", "body_vertices")
     if not np.isfinite(body).all():
         return np.full(points.shape[:2], np.nan)
+    faces = turned_outward(body[0], faces, "the body")
     meshes = BodyMeshes(_tensor(body[0]), torch.from_numpy(faces))
     result = np.empty(points.shape[:2])
     still = body.strides[0] == 0

@@ -18,13 +18,15 @@ from warpgarment.geometry.checks import (
     repeated_vertices,
     to_numpy,
 )
+from warpgarment.geometry.orientation import turned_outward
 
 
 class BodyMotion:
     """A deforming triangle mesh that a garment collides with.
 
-    The mesh may be open, in several parts, and intersect itself. Faces without area are ignored by the distance
-    queries; their number in the first frame is `degenerate_faces`.
+    The mesh may be open, in several parts, and intersect itself. Which side is outside is decided from the first frame
+    (`geometry/orientation.py`): faces that look inwards are turned round, with a warning that says how many. Faces
+    without area are ignored by the distance queries; their number in the first frame is `degenerate_faces`.
 
     Attributes:
         vertices: Positions [m], Y up, float32, shape [T,V,3].
@@ -33,7 +35,7 @@ class BodyMotion:
 
     Args:
         vertices: Positions [m], shape [T,V,3]; NumPy, torch or nested lists.
-        faces: Vertex indices, integers, shape [F,3].
+        faces: Vertex indices, integers, shape [F,3], in either winding.
         fps: Frames per second, positive.
 
     Raises:
@@ -49,6 +51,14 @@ class BodyMotion:
         self.degenerate_faces = int(np.count_nonzero(flat))
         if flat.all():
             complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
+        self.faces = turned_outward(self.vertices[0], self.faces, "the body")
+
+    @classmethod
+    def _derived(cls, vertices: np.ndarray, faces: np.ndarray, fps: float, degenerate_faces: int) -> BodyMotion:
+        """A motion of vertices and faces that another one has checked and turned outwards."""
+        motion = cls.__new__(cls)
+        motion.vertices, motion.faces, motion.fps, motion.degenerate_faces = vertices, faces, fps, degenerate_faces
+        return motion
 
     def __repr__(self) -> str:
         frames, count = self.vertices.shape[:2]
@@ -131,7 +141,7 @@ class BodyMotion:
         before = np.minimum(time.astype(np.int64), max(last - 1, 0))
         share = (time - before).astype(np.float32)[:, None, None]
         vertices = self.vertices[before] * (1 - share) + self.vertices[np.minimum(before + 1, last)] * share
-        return BodyMotion(vertices, self.faces, fps)
+        return self._derived(vertices, self.faces, fps, self.degenerate_faces)
 
     def submesh(self, face_mask: Any) -> BodyMotion:
         """The motion of some faces only, without the vertices that no face needs any more.
@@ -148,4 +158,7 @@ class BodyMotion:
         if not mask.any():
             raise MeshError("face_mask keeps no face.")
         used, faces = np.unique(self.faces[mask], return_inverse=True)
-        return BodyMotion(self.vertices[:, used], faces.reshape(-1, 3), self.fps)
+        faces = faces.reshape(-1, 3).astype(np.int32)
+        vertices = self.vertices[:, used]
+        flat = repeated_vertices(faces) | no_area(vertices[0], faces)
+        return self._derived(vertices, faces, self.fps, int(np.count_nonzero(flat)))

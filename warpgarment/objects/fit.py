@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.checks import checked_faces, checked_positions, to_numpy
+from warpgarment.geometry.orientation import turned_outward
 from warpgarment.kernels.mesh.laplacian import half_cotangents
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
@@ -80,7 +81,7 @@ def _body(body: Any, faces: np.ndarray | None, name: str) -> tuple[np.ndarray, n
         vertices, own = body.vertices[0], body.faces
     elif isinstance(body, tuple) and len(body) == 2:
         vertices = checked_positions(body[0], name=f"{name} vertices")
-        own = checked_faces(body[1], len(vertices), name=f"{name} faces")
+        own = turned_outward(vertices, checked_faces(body[1], len(vertices), name=f"{name} faces"), name)
     elif faces is None:
         raise MeshError(f"{name} must be (vertices, faces) or a BodyMotion.")
     else:
