@@ -1,4 +1,4 @@
-"""Which side of a body is outside. What is right is known from how the meshes are made, not from the code under test."""
+"""Which side of a body is outside. What is right is known from how the meshes are made."""
 
 from __future__ import annotations
 
