@@ -16,6 +16,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from datetime import timedelta
+from types import TracebackType
 
 import torch
 import torch.distributed as dist
@@ -75,7 +76,9 @@ class Group:
     def __enter__(self) -> Group:
         return self
 
-    def __exit__(self, kind, error, trace) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Leaves the group; after an error it is left as it is, since others may still wait in it for ever."""
         if self.size > 1 and kind is None:
             dist.barrier()

@@ -19,6 +19,7 @@ skinned garment is tied to the body everywhere, and the rigid one nowhere.
 from __future__ import annotations
 
 import warnings
+from typing import TYPE_CHECKING, Protocol, cast
 
 import igl
 import numpy as np
@@ -32,15 +33,43 @@ from warpgarment.kernels.mesh.laplacian import components
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 
+if TYPE_CHECKING:
+    from warpgarment.sim.simulator import Simulator
+
+
+class Recorded(Protocol):
+    """A garment and frames of it, float32 [T,V,3] in metres."""
+
+    @property
+    def garment(self) -> Garment:
+        """The rest mesh."""
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """The frames."""
+
+
+class RecordedOnBody(Recorded, Protocol):
+    """These and the body, as a `Sequence` of a data set has them."""
+
+    def body(self) -> BodyMotion:
+        """The collider."""
+
 
 def predict(
-    simulator, sequence, newest: int, steps: int, *, cold: bool = False, body: BodyMotion | None = None
+    simulator: Simulator,
+    sequence: Recorded,
+    newest: int,
+    steps: int,
+    *,
+    cold: bool = False,
+    body: BodyMotion | None = None,
 ) -> np.ndarray:
     """Rolls a sequence out from its recorded frames.
 
     Args:
         simulator: A `Simulator`.
-        sequence: A `dataset.Sequence`.
+        sequence: A `Sequence` of a data set; less will do where `body` is given.
         newest: The newest recorded frame that the network may see.
         steps: Frames to predict; frame `newest + steps` of the body must exist.
         cold: See only that one frame.
@@ -50,18 +79,20 @@ def predict(
         Vertices of frames newest+1 .. newest+steps [m], float32 [steps,V,3]; NaN after a rollout that failed.
     """
     history = simulator.network.config.history
-    body = sequence.body() if body is None else body
+    body = cast(RecordedOnBody, sequence).body() if body is None else body
+    start: np.ndarray | None = None
+    known: np.ndarray | None = None
     if cold:
-        first, known = newest, {"first_vertices": np.array(sequence.vertices[newest], np.float32)}
+        first, start = newest, np.array(sequence.vertices[newest], np.float32)
     elif newest >= history - 1:
         first = newest - history + 1
-        known = {"history": np.array(sequence.vertices[first : newest + 1], np.float32)}
+        known = np.array(sequence.vertices[first : newest + 1], np.float32)
     else:
         raise ValueError(f"a warm start needs {history} recorded frames; up to frame {newest} there are {newest + 1}")
     part = BodyMotion(body.vertices[first : newest + steps + 1], body.faces, body.fps)
     with warnings.catch_warnings():  # a rollout that fails shows in the figures
         warnings.simplefilter("ignore", RuntimeWarning)
-        motion = simulator.rollout(sequence.garment, part, **known)
+        motion = simulator.rollout(sequence.garment, part, first_vertices=start, history=known)
     predicted = np.full((steps, *sequence.vertices.shape[1:]), np.nan, np.float32)
     moved = np.asarray(motion.vertices)[newest + 1 - first :]
     predicted[: len(moved)] = moved

@@ -154,7 +154,9 @@ def layer_collision(outer_vertices: Any, inner_vertices: Any, inner_faces: Any) 
     return float(np.mean(shares))
 
 
-def _through(outer, inner, faces, border_edge, border_corner) -> float:
+def _through(
+    outer: np.ndarray, inner: np.ndarray, faces: np.ndarray, border_edge: np.ndarray, border_corner: np.ndarray
+) -> float:
     """Share of one frame. A barycentric coordinate of 0 puts the closest point on an edge, one of 1 on a corner."""
     inner = np.ascontiguousarray(inner, dtype=np.float64)
     sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL

@@ -12,7 +12,7 @@ Each component is solved in the first of these ways that its solver was built fo
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -122,7 +122,15 @@ def collision_solve(
 
 
 @collision_solve.register_fake
-def _(vertices, normal, closest, epsilon, tolerance, model, max_iterations):
+def _(
+    vertices: torch.Tensor,
+    normal: torch.Tensor,
+    closest: torch.Tensor,
+    epsilon: float,
+    tolerance: torch.Tensor,
+    model: list[torch.Tensor],
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     count = tolerance.shape[0]
     return (
         torch.empty_like(vertices, memory_format=torch.contiguous_format),
@@ -152,18 +160,20 @@ def collision_solve_backward(
 
 
 @collision_solve_backward.register_fake
-def _(grad, normal, tolerance, model, max_iterations):
+def _(
+    grad: torch.Tensor, normal: torch.Tensor, tolerance: torch.Tensor, model: list[torch.Tensor], max_iterations: int
+) -> torch.Tensor:
     return torch.empty_like(grad, memory_format=torch.contiguous_format)
 
 
-def _setup(ctx, inputs, output):
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
     _, normal, _, _, tolerance, model, max_iterations = inputs
     ctx.save_for_backward(normal, tolerance, *model)
     ctx.max_iterations = max_iterations
     ctx.mark_non_differentiable(*output[1:])
 
 
-def _backward(ctx, grad, _iterations, _error):
+def _backward(ctx: Any, grad: torch.Tensor, _iterations: None, _error: None) -> tuple[Any, ...]:
     normal, tolerance, *model = ctx.saved_tensors
     solve = torch.ops.warpgarment.collision_solve_backward
     return solve(grad, normal, tolerance, model, ctx.max_iterations), None, None, None, None, [None] * len(model), None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -145,7 +145,14 @@ def poisson_solve(
 
 
 @poisson_solve.register_fake
-def _(phi, mean, pin_target, initial, model, max_iterations):
+def _(
+    phi: torch.Tensor,
+    mean: torch.Tensor,
+    pin_target: torch.Tensor,
+    initial: torch.Tensor,
+    model: list[torch.Tensor],
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     count = mean.shape[0]
     return (
         torch.empty_like(initial, memory_format=torch.contiguous_format),
@@ -201,7 +208,9 @@ def poisson_solve_backward(
 
 
 @poisson_solve_backward.register_fake
-def _(grad_vertices, mean, model, max_iterations):
+def _(
+    grad_vertices: torch.Tensor, mean: torch.Tensor, model: list[torch.Tensor], max_iterations: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     tensors = _named(model)
     return (
         mean.new_empty((tensors["faces"].shape[0], 3, 3)),
@@ -210,14 +219,14 @@ def _(grad_vertices, mean, model, max_iterations):
     )
 
 
-def _setup(ctx, inputs, output):
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
     _, mean, _, _, model, max_iterations = inputs
     ctx.save_for_backward(mean, *model)
     ctx.max_iterations = max_iterations
     ctx.mark_non_differentiable(*output[1:])
 
 
-def _backward(ctx, grad_vertices, _iterations, _error):
+def _backward(ctx: Any, grad_vertices: torch.Tensor, _iterations: None, _error: None) -> tuple[Any, ...]:
     mean, *model = ctx.saved_tensors
     grad_phi, grad_mean, grad_pins = torch.ops.warpgarment.poisson_solve_backward(
         grad_vertices, mean, model, ctx.max_iterations

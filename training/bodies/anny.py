@@ -12,6 +12,7 @@ import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -162,7 +163,7 @@ class AnnyBodies:
 
 
 @lru_cache(maxsize=1)
-def _load_anny():
+def _load_anny() -> Any:
     try:
         import anny
         import torch
@@ -173,7 +174,7 @@ def _load_anny():
     return model.to(torch.float32)
 
 
-def _evaluate(model, phenotype: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+def _evaluate(model: Any, phenotype: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
     """Rest vertices [12272, 3] and bone heads [B, 3] of a phenotype [m], Y up."""
     import torch
 
@@ -278,7 +279,15 @@ def smoothed(vertices: np.ndarray, faces: np.ndarray, rounds: int = 12) -> np.nd
     return vertices
 
 
-def _interpolate_weights(indices, weights, loops, corners, barycentric, bones: int, keep: int = 4):
+def _interpolate_weights(
+    indices: np.ndarray,
+    weights: np.ndarray,
+    loops: list[np.ndarray],
+    corners: np.ndarray,
+    barycentric: np.ndarray,
+    bones: int,
+    keep: int = 4,
+) -> tuple[np.ndarray, np.ndarray]:
     """Skinning weights of the template vertices: interpolated, the `keep` largest kept and renormalised."""
     dense = np.zeros((len(indices), bones))
     np.add.at(dense, (np.arange(len(indices))[:, None], indices), weights)

@@ -11,6 +11,7 @@ so that no frame gets less than it needs.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,11 +90,11 @@ def resolve_clearance(body: RestBody, poses: PoseSequence, gap: float = 0.02, li
     return Clearance(now, unresolved, before, after, turned)
 
 
-def _blocks(count: int):
+def _blocks(count: int) -> Iterator[slice]:
     return (slice(k, min(k + _BLOCK, count)) for k in range(0, count, _BLOCK))
 
 
-def _measured(body: RestBody, poses: PoseSequence, contact: Contact):
+def _measured(body: RestBody, poses: PoseSequence, contact: Contact) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """For blocks of frames: their slice, posed targets [F, N, 3] and bone transforms [F, B, 3, 4]."""
     targets = contact.targets
     for block in _blocks(len(poses)):
@@ -114,7 +115,14 @@ def _least_gap(body: RestBody, poses: PoseSequence, possible: list[Contact], gap
     return least
 
 
-def _shortage(body: RestBody, contact: Contact, points, transforms, turn, back) -> np.ndarray:
+def _shortage(
+    body: RestBody,
+    contact: Contact,
+    points: np.ndarray,
+    transforms: np.ndarray,
+    turn: np.ndarray | None,
+    back: np.ndarray | None,
+) -> np.ndarray:
     """Largest lack of distance in each frame [m], shape [F].
 
     Args:
@@ -198,7 +206,14 @@ def _axis(body: RestBody, poses: PoseSequence, limb: str, away: np.ndarray) -> n
     return np.divide(axis, length, out=np.zeros_like(axis), where=length > 1e-12)
 
 
-def _least_angle(body, contact, points, transforms, axes, left: np.ndarray) -> np.ndarray:
+def _least_angle(
+    body: RestBody,
+    contact: Contact,
+    points: np.ndarray,
+    transforms: np.ndarray,
+    axes: Sequence[np.ndarray],
+    left: np.ndarray,
+) -> np.ndarray:
     """Smallest angle up to `left` [rad] that keeps the distance, or the one that comes closest, shape [F]."""
     count = len(points)
     before = np.full(count, np.inf)

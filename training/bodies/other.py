@@ -8,7 +8,7 @@ garments, motions and the teachers work unchanged.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -32,7 +32,7 @@ _FROM_SMPLX = {
     "R_Collar": "RightShoulder", "R_Shoulder": "RightArm", "R_Elbow": "RightForeArm", "R_Wrist": "RightHand",
 }  # fmt: skip
 
-_TREE = {
+_TREE: dict[str, str | None] = {
     "Hips": None,
     "LeftUpLeg": "Hips", "LeftLeg": "LeftUpLeg", "LeftFoot": "LeftLeg", "LeftToeBase": "LeftFoot",
     "RightUpLeg": "Hips", "RightLeg": "RightUpLeg", "RightFoot": "RightLeg", "RightToeBase": "RightFoot",
@@ -42,7 +42,9 @@ _TREE = {
 }  # fmt: skip
 
 
-def wrapped(vertices: np.ndarray, faces: np.ndarray, closing=0.012, cell=_CELL, wanted: int = TEMPLATE_FACES):
+def wrapped(
+    vertices: np.ndarray, faces: np.ndarray, closing: float = 0.012, cell: float = _CELL, wanted: int = TEMPLATE_FACES
+) -> tuple[np.ndarray, np.ndarray]:
     """One closed surface around closed parts that may overlap or have gaps between them.
 
     Args:
@@ -61,7 +63,13 @@ def wrapped(vertices: np.ndarray, faces: np.ndarray, closing=0.012, cell=_CELL, 
     return contoured(lambda points: _signed_distance(points, *swollen) + closing, low, high, cell, wanted)
 
 
-def contoured(distance: Callable[[np.ndarray], np.ndarray], low, high, cell=_CELL, wanted: int = TEMPLATE_FACES):
+def contoured(
+    distance: Callable[[np.ndarray], np.ndarray],
+    low: Sequence[float] | np.ndarray,
+    high: Sequence[float] | np.ndarray,
+    cell: float = _CELL,
+    wanted: int = TEMPLATE_FACES,
+) -> tuple[np.ndarray, np.ndarray]:
     """The surface where a signed distance is zero, evenly triangulated and without edges.
 
     Args:
@@ -78,7 +86,12 @@ def contoured(distance: Callable[[np.ndarray], np.ndarray], low, high, cell=_CEL
     return smoothed(vertices, faces), faces.astype(np.int32)
 
 
-def _contour(distance: Callable[[np.ndarray], np.ndarray], low, high, cell: float) -> tuple[np.ndarray, np.ndarray]:
+def _contour(
+    distance: Callable[[np.ndarray], np.ndarray],
+    low: Sequence[float] | np.ndarray,
+    high: Sequence[float] | np.ndarray,
+    cell: float,
+) -> tuple[np.ndarray, np.ndarray]:
     axes = [np.arange(a - 2 * cell, b + 3 * cell, cell) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=3).reshape(-1, 3)  # x runs fastest
     vertices, faces, *_ = igl.marching_cubes(distance(grid), grid, *(len(axis) for axis in axes), 0.0)
@@ -94,7 +107,13 @@ def _signed_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
     return igl.signed_distance(points, vertices, np.ascontiguousarray(faces, dtype=np.int64), sign_type=sign)[0]
 
 
-def rigged(vertices: np.ndarray, faces: np.ndarray, parts: np.ndarray, joints: dict[str, np.ndarray], tree) -> RestBody:
+def rigged(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    parts: np.ndarray,
+    joints: dict[str, np.ndarray],
+    tree: dict[str, str | None],
+) -> RestBody:
     """A body whose vertices follow the bones of their parts, mixed near joints.
 
     Args:
@@ -219,7 +238,7 @@ def creature_body() -> RestBody:
     return rigged(vertices, faces, parts, joints, tree)
 
 
-def _shape_distance(points: np.ndarray, kind: str, a: np.ndarray, b: np.ndarray, radii) -> np.ndarray:
+def _shape_distance(points: np.ndarray, kind: str, a: np.ndarray, b: np.ndarray, radii: Sequence[float]) -> np.ndarray:
     """Distance [N] to a tapered capsule or, to first order, to an ellipsoid [m]."""
     if kind == "ellipsoid":
         scaled = (points - a) / b

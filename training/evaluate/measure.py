@@ -205,7 +205,7 @@ def _describe(path: Path, simulator: Simulator) -> dict[str, Any]:
     return {"file": path.name, "config": vars(simulator.network.config), "notes": notes}
 
 
-def _pyplot():
+def _pyplot() -> Any:
     try:
         import matplotlib
     except ImportError as error:

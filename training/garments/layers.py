@@ -156,7 +156,15 @@ class Located:
         interior: Whether the closest point is off the border, so that the sign means something, bool [N].
     """
 
-    def __init__(self, distance, face, closest, normal, weights, interior):
+    def __init__(
+        self,
+        distance: np.ndarray,
+        face: np.ndarray,
+        closest: np.ndarray,
+        normal: np.ndarray,
+        weights: np.ndarray,
+        interior: np.ndarray,
+    ) -> None:
         self.distance, self.face, self.closest = distance, face, closest
         self.normal, self.weights, self.interior = normal, weights, interior
 

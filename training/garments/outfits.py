@@ -182,7 +182,9 @@ def layers_disjoint(garments: Sequence[Garment]) -> LayerReport:
     return LayerReport(between, float(gap), inside, sum(crossing.values()) - between, crossing)
 
 
-def _over(garment: Garment, edge: float, below: Sequence[Garment], body: RestBody, gap: float, between: float):
+def _over(
+    garment: Garment, edge: float, below: Sequence[Garment], body: RestBody, gap: float, between: float
+) -> tuple[Garment, float]:
     """The garment moved off those below it, and remeshed where that stretched it; and the edge length aimed at."""
     inner = [_Below(g) for g in below]
     done = _moved(garment, _cleared(garment.vertices.astype(np.float64), garment.faces, inner, body, gap, between))
@@ -226,7 +228,9 @@ class _Below:
         self.normals = np.concatenate([of_vertices, of_edges, of_faces])
 
 
-def _cleared(vertices, faces, below: Sequence[_Below], body: RestBody, gap: float, between: float) -> np.ndarray:
+def _cleared(
+    vertices: np.ndarray, faces: np.ndarray, below: Sequence[_Below], body: RestBody, gap: float, between: float
+) -> np.ndarray:
     """Vertices moved to at least `gap` from the body and `between` in front of the garments below.
 
     They move along smoothed normals of the sheet as it was cut, each by a height of its own. Heights are smoothed and
@@ -268,7 +272,7 @@ def _off_inner(points: np.ndarray, direction: np.ndarray, inner: _Below, between
     return np.where(wanted, rise / _steepness(at.distance, points, at.closest, at.normal, direction), 0.0)
 
 
-def _off_points(points, direction, sheet: Sheet, inner: _Below, between: float) -> np.ndarray:
+def _off_points(points: np.ndarray, direction: np.ndarray, sheet: Sheet, inner: _Below, between: float) -> np.ndarray:
     """How far the corners of faces that points of an inner garment poke through or come too close to must rise [m]."""
     at = sheet.locate(points, inner.points)
     wanted = at.interior & (np.abs(at.distance) < _POKE) & ((at.normal * inner.normals).sum(1) > 0.5)
@@ -279,7 +283,9 @@ def _off_points(points, direction, sheet: Sheet, inner: _Below, between: float) 
     return rise
 
 
-def _steepness(distance, points, closest, normal, direction) -> np.ndarray:
+def _steepness(
+    distance: np.ndarray, points: np.ndarray, closest: np.ndarray, normal: np.ndarray, direction: np.ndarray
+) -> np.ndarray:
     """Growth of the signed distance along a direction, at least a third."""
     away = np.where(np.abs(distance)[:, None] > 1e-5, (points - closest) * np.sign(distance)[:, None], normal)
     away = away / np.linalg.norm(away, axis=1, keepdims=True)

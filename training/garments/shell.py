@@ -65,7 +65,7 @@ def shell(body: RestBody, ease: np.ndarray, wanted: np.ndarray) -> Shell:
     return Shell(vertices, faces, *_nearest(body, vertices)[1:])
 
 
-def _nearest(body: RestBody, points: np.ndarray):
+def _nearest(body: RestBody, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance [N], nearest body point [N, 3], its face's vertices [N, 3] and barycentric coordinates there."""
     faces = body.faces.astype(np.int64)
     distance, face, closest, *_ = igl.signed_distance(

@@ -71,7 +71,7 @@ def bvh_length(path: str | Path) -> tuple[int, float]:
     raise MeshError(f"{path.name} is not a BVH file: it has no header with Frames and Frame Time.")
 
 
-def _hierarchy(tokens: list[str]):
+def _hierarchy(tokens: list[str]) -> tuple[list[str], list[int], np.ndarray, list[list[str]]]:
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
@@ -109,7 +109,9 @@ def _hierarchy(tokens: list[str]):
     return names, parents, np.array(offsets), channels
 
 
-def _forward(parents, offsets, channels, values):
+def _forward(
+    parents: list[int], offsets: np.ndarray, channels: list[list[str]], values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """World rotations [T, J, 3, 3] and positions [T, J, 3] by forward kinematics."""
     frames, joints = len(values), len(parents)
     rotations, positions = np.empty((frames, joints, 3, 3)), np.empty((frames, joints, 3))

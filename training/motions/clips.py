@@ -7,6 +7,7 @@ limbs onto the target's rest pose. Root translation is scaled by the ratio of le
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,7 @@ def clip_frames(path: str | Path, fps: float = 30.0) -> int:
     return resampled_length(frames, rate, fps)
 
 
-def _reader(path: str | Path):
+def _reader(path: str | Path) -> tuple[Callable[..., Clip], Callable[[str | Path], tuple[int, float]]]:
     path = Path(path)
     if path.suffix.lower() not in _READERS:
         raise MeshError(f"{path.name}: motions are read from .bvh and AMASS .npz files, not from {path.suffix!r}.")
@@ -114,7 +115,7 @@ def jumps(body: RestBody, poses: PoseSequence) -> np.ndarray:
     return np.concatenate([[False], too_fast])
 
 
-def _limb_alignment(clip: Clip, body: RestBody, source, bone: str, child: str) -> np.ndarray:
+def _limb_alignment(clip: Clip, body: RestBody, source: dict[str, str | None], bone: str, child: str) -> np.ndarray:
     """Smallest rotation from the target's rest direction of a limb to the source's zero-pose direction."""
     a = body.joint(child) - body.joint(bone)
     b = clip.offsets[clip.names.index(source[child])]
@@ -126,7 +127,7 @@ def _limb_alignment(clip: Clip, body: RestBody, source, bone: str, child: str) -
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, a @ b)).as_matrix()
 
 
-def _leg_ratio(clip: Clip, body: RestBody, source) -> float:
+def _leg_ratio(clip: Clip, body: RestBody, source: dict[str, str | None]) -> float:
     bones = ("LeftUpLeg", "LeftLeg", "LeftFoot")
     target = sum(np.linalg.norm(body.joint(b) - body.joint(a)) for a, b in itertools.pairwise(bones))
     own = sum(np.linalg.norm(clip.offsets[clip.names.index(source[b])]) for b in bones[1:])

@@ -37,7 +37,7 @@ def procedural(body: RestBody, kind: str, frames: int, seed: int, fps: float = 3
     return _assemble(body, curves, fps)
 
 
-def _walk(time, ease, rng) -> dict[str, np.ndarray]:
+def _walk(time: np.ndarray, ease: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
     cadence, stride = rng.uniform(0.8, 1.0), rng.uniform(0.8, 1.15)
     phase = 2 * np.pi * cadence * np.maximum(time - 0.4, 0)
     hip = np.radians(24) * stride * ease
@@ -59,7 +59,7 @@ def _walk(time, ease, rng) -> dict[str, np.ndarray]:
     return curves
 
 
-def _run(time, ease, rng) -> dict[str, np.ndarray]:
+def _run(time: np.ndarray, ease: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
     curves = _walk(time, ease, rng)
     cadence = rng.uniform(1.25, 1.45)
     phase = 2 * np.pi * cadence * np.maximum(time - 0.4, 0)
@@ -78,12 +78,12 @@ def _run(time, ease, rng) -> dict[str, np.ndarray]:
     return curves
 
 
-def _still(time) -> dict[str, np.ndarray]:
+def _still(time: np.ndarray) -> dict[str, np.ndarray]:
     names = [s + b for s in ("Left", "Right") for b in ("UpLeg", "Leg", "Foot", "Arm", "ForeArm")]
     return {name: np.zeros_like(time) for name in (*names, "speed", "flight", "sway", "twist", "roll", "lean")}
 
 
-def _jump(time, ease, rng) -> dict[str, np.ndarray]:
+def _jump(time: np.ndarray, ease: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
     curves = _still(time)
     period, height = rng.uniform(1.3, 1.8), rng.uniform(0.15, 0.3)
     t = np.maximum(time - 0.5, 0) % period / period
@@ -100,7 +100,7 @@ def _jump(time, ease, rng) -> dict[str, np.ndarray]:
     return curves
 
 
-def _bend(time, ease, rng) -> dict[str, np.ndarray]:
+def _bend(time: np.ndarray, ease: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
     curves = _still(time)
     rate, depth = rng.uniform(0.25, 0.45), rng.uniform(25, 50)
     phase = 2 * np.pi * rate * time
@@ -110,7 +110,7 @@ def _bend(time, ease, rng) -> dict[str, np.ndarray]:
     return curves
 
 
-def _arms(time, ease, rng) -> dict[str, np.ndarray]:
+def _arms(time: np.ndarray, ease: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
     curves = _still(time)
     rate = rng.uniform(0.35, 0.6)
     phase = 2 * np.pi * rate * time
@@ -125,7 +125,7 @@ def _assemble(body: RestBody, curves: dict[str, np.ndarray], fps: float) -> Pose
     frames = len(curves["lean"])
     zero = np.zeros(frames)
 
-    def axis(x=zero, y=zero, z=zero) -> np.ndarray:
+    def axis(x: np.ndarray = zero, y: np.ndarray = zero, z: np.ndarray = zero) -> np.ndarray:
         return Rotation.from_rotvec(np.stack([x + zero, y + zero, z + zero], 1)).as_matrix()
 
     lean, twist, roll = curves["lean"], curves["twist"], curves["roll"]

@@ -32,6 +32,7 @@ from warpgarment.io.atomic import atomic_folder
 from warpgarment.kernels.deformation.gradients import face_centroids
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction
 from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.training.rollouts import RecordedOnBody
 
 CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
 MANIFEST = "manifest.json"
@@ -77,7 +78,7 @@ def key_of(folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def compute(sequence, device: torch.device | str = "cpu") -> np.ndarray:
+def compute(sequence: RecordedOnBody, device: torch.device | str = "cpu") -> np.ndarray:
     """Body interaction of every face in every frame but the last.
 
     Args:
@@ -124,7 +125,7 @@ def unpack(rows: torch.Tensor) -> BodyInteraction:
 
 
 def cached(
-    sequence, folder: Path, cache: Path, device: torch.device | str = "cpu"
+    sequence: RecordedOnBody, folder: Path, cache: Path, device: torch.device | str = "cpu"
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Loads a sequence's interactions and geodesics from the cache, computing and storing them first where need be.
 

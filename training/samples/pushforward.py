@@ -10,12 +10,16 @@ see the same samples. Several processes share the rollouts, and all get all of t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import predict
+
+if TYPE_CHECKING:
+    from warpgarment.sim.simulator import Simulator
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ class Pool:
             self.rollouts.append((s, first, tensors[f"pool.{r}.displacement"].numpy()))
 
     def refresh(
-        self, simulator, sequences: list, config: PushforwardConfig, rng: np.random.Generator, group: Group
+        self, simulator: Simulator, sequences: list, config: PushforwardConfig, rng: np.random.Generator, group: Group
     ) -> float:
         """Fills the pool anew.
 

@@ -10,11 +10,13 @@ import torch
 
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, inverse_rest_frames
 from warpgarment.kernels.mesh.laplacian import components
+from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.layout import dense_weights
 from warpgarment.nn.heading import yaw
 from warpgarment.nn.patches.layout import Patches, garment_patches, patches
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
+from warpgarment.training.data.sequence import Sequence
 
 from .interactions import COLUMNS, UnusableSequence, cached
 from .noise import NoiseBasis
@@ -31,7 +33,9 @@ class SequenceData:
         device: Where samples are built.
     """
 
-    def __init__(self, sequence, folder: Path, cache: Path, network, device: torch.device) -> None:
+    def __init__(
+        self, sequence: Sequence, folder: Path, cache: Path, network: NetworkConfig, device: torch.device
+    ) -> None:
         garment = sequence.garment
         self.name, self.device, self.source = Path(folder).name, device, sequence
         recorded = np.asarray(sequence.vertices, np.float32)

@@ -42,7 +42,13 @@ class Keeper:
             self.kept[sequence.name] = sequence, newest, vertices
 
 
-def rollouts(path: Path, keeper: Keeper, titles: Ordered[tuple[str, str]], size=(200, 290), samples: int = 2) -> bool:
+def rollouts(
+    path: Path,
+    keeper: Keeper,
+    titles: Ordered[tuple[str, str]],
+    size: tuple[int, int] = (200, 290),
+    samples: int = 2,
+) -> bool:
     """Draws what was kept: a row of moments of the network and one of the recording, for each sequence.
 
     Args:

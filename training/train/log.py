@@ -73,7 +73,7 @@ def _step(line: str) -> float:
         return math.inf
 
 
-def _tensorboard(out: Path, resumed: int | None):
+def _tensorboard(out: Path, resumed: int | None) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:

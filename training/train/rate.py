@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+import torch
+
 from warpgarment.nn.flops import matrix_peak
 
 
@@ -16,7 +18,7 @@ class Rate:
         processes: How many train together, each on such a device.
     """
 
-    def __init__(self, device, precision: str, processes: int) -> None:
+    def __init__(self, device: torch.device, precision: str, processes: int) -> None:
         self.peak, self.processes = matrix_peak(device, precision), processes
         self._began: float | None = None
         self._spent, self._samples, self._flops = 0.0, 0, 0

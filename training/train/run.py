@@ -7,7 +7,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -31,6 +31,9 @@ from .log import RunLog, json_number
 from .objective import Objective, Trainer
 from .rate import Rate, spelt
 from .unrolled_objective import UnrolledObjective
+
+if TYPE_CHECKING:
+    from warpgarment.sim.simulator import Simulator
 
 STATE = "state.safetensors"
 SHARED_OUT = "All machines must see the same out folder."
@@ -265,7 +268,7 @@ class Run:
     def _due(self, period: int) -> bool:
         return self.step % period == 0
 
-    def _simulator(self):
+    def _simulator(self) -> Simulator:
         from warpgarment.sim.simulator import Simulator
 
         return Simulator(self.average.network, self.device)
@@ -280,7 +283,7 @@ class Run:
             notes["training"].pop(key)
         checkpoint.save(self.average.network, self.out / name, notes=notes)
 
-    def log_training(self, bar) -> None:
+    def log_training(self, bar: tqdm) -> None:
         """A line of the log: means of the figures since the last one, and the rate."""
         self.read_losses()
         means = map(float, np.mean(self.recent, axis=0))
@@ -291,7 +294,7 @@ class Run:
         entry["lr"] = self.optimizer.param_groups[0]["lr"]
         self.log.write(self.step, self.elapsed(), entry | self.figures)
 
-    def _note(self, **values) -> None:
+    def _note(self, **values: Any) -> None:
         self.log.write(self.step, self.elapsed(), values, aloud=True)
 
     def _give_up(self, step: int) -> None:

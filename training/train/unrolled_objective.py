@@ -27,6 +27,7 @@ training; a change of size does not. Batches are built in line, `ahead` or not.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -110,7 +111,7 @@ class UnrolledObjective(nn.Module):
         total = terms[0] + self.unroll.position * position if self.unroll.position else terms[0]
         return torch.stack([total, *terms[1:], position if self.unroll.position else position.detach()])
 
-    def steps(self, batch: UnrolledBatch):
+    def steps(self, batch: UnrolledBatch) -> Iterator[tuple[torch.Tensor, torch.Tensor | None, torch.Tensor]]:
         """Yields for each step: the losses [4] of `losses.Losses`, predicted vertices [V,3] (None where nothing needs
         the last ones) and recorded ones."""
         scene, config = batch.scene, self.network.config

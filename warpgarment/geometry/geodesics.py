@@ -196,6 +196,10 @@ def _segments(mesh: _Unfolding) -> csr_matrix:
     return csr_matrix((length[keep], (rows[keep], cols[keep])), shape=(mesh.node_count,) * 2)
 
 
+Seen = tuple[np.ndarray, np.ndarray, np.ndarray]  # source, node, length [m] of each straight segment
+Windows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Seen]  # source, half-edge, right [N,2], left [N,2]
+
+
 class _Unfolding:
     """Half-edge 3f + k runs from corner k of face f to corner k+1; windows are parallel arrays, one entry each."""
 
@@ -233,7 +237,7 @@ class _Unfolding:
         place = np.minimum(np.searchsorted(forward[order], backward), len(order) - 1)
         return np.where(forward[order][place] == backward, order[place], -1)
 
-    def over_midpoints(self):
+    def over_midpoints(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Neighbours by way of the middle of their edge, so that even faces without area are linked."""
         half = np.nonzero(self.twin >= 0)[0]
         to_middle = np.linalg.norm(
@@ -245,7 +249,7 @@ class _Unfolding:
         """Centroid of each half-edge's face, its tail at the origin and its head on the first axis, shape [3F,2]."""
         return (np.stack([self.length, np.zeros(len(self.length))], axis=1) + self.apex) / 3
 
-    def from_centroids(self):
+    def from_centroids(self) -> Windows:
         """Windows over the three edges of every face, seen from its centroid, and its own bending corners."""
         half = np.arange(len(self.tail))
         start = np.zeros((len(half), 2))
@@ -257,7 +261,7 @@ class _Unfolding:
         seen = (source[own], node[own], np.linalg.norm(centroid[own], axis=1))
         return source, half, start - centroid, end - centroid, seen
 
-    def from_vertices(self):
+    def from_vertices(self) -> Windows:
         """Windows over the edge opposite to every corner at a bending vertex, with that face's centroid and corners."""
         corner = np.nonzero(self.node_of_vertex[self.tail] >= 0)[0]
         source, half = self.node_of_vertex[self.tail[corner]], self.next[corner]
@@ -274,7 +278,7 @@ class _Unfolding:
         )
         return source, half, right, left, seen
 
-    def spread(self, windows):
+    def spread(self, windows: Windows) -> tuple[np.ndarray, ...]:
         """Unfolds face after face; returns sources, targets and lengths [m] of all straight segments seen."""
         source, half, right, left, seen = windows
         ray_right, ray_left = right, left

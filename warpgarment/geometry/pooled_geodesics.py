@@ -19,7 +19,7 @@ p = 2, on a T-shirt of 1,354 faces.)
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -44,7 +44,7 @@ class PooledGeodesics(NamedTuple):
     weight: np.ndarray  # float32 [F,NEAR], rows sum to one
 
 
-def pooled_geodesics(rest_vertices, faces, centres: int = CENTRES) -> PooledGeodesics:
+def pooled_geodesics(rest_vertices: Any, faces: Any, centres: int = CENTRES) -> PooledGeodesics:
     """Distances between centres, and the interpolation from them to all faces.
 
     Args:

@@ -6,6 +6,7 @@ vertex.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ def read_polygons(path: Path) -> tuple[np.ndarray, list[list[int]]]:
     return positions, polygons
 
 
-def _lines(path: Path):
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without comments, continued ones joined."""
     try:
         text = path.read_text(encoding="utf-8", errors="surrogateescape")
@@ -75,7 +76,8 @@ def _lines(path: Path):
         raise MeshError(f"{path} is a folder, not an OBJ file.") from None
     if "\0" in text[:4096]:
         raise MeshError(f"{path}: binary data; this is not an OBJ file.")
-    pending, start = "", None
+    pending = ""
+    start: int | None = None
     for number, line in enumerate(text.splitlines(), 1):
         line = line.split("#", 1)[0]
         start = start or number
@@ -84,7 +86,7 @@ def _lines(path: Path):
             continue
         yield start, pending + line
         pending, start = "", None
-    if pending:
+    if pending and start is not None:
         yield start, pending
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ class UsdMesh(NamedTuple):
     fps: float | None  # None for a single frame
 
 
-def _pxr():
+def _pxr() -> tuple[Any, ...]:
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, Vt
     except ImportError:
@@ -146,7 +146,7 @@ def read_usd(path: Path, *, mesh: str | None = None, frames: bool = True, conver
     return UsdMesh(prim.GetName(), vertices.astype(np.float32), faces, fps)
 
 
-def _choose(prims: list, mesh: str | None, path: Path):
+def _choose(prims: list, mesh: str | None, path: Path) -> Any:
     if mesh is not None:
         named = [p for p in prims if mesh in (p.GetName(), str(p.GetPath()))]
         if len(named) != 1:
@@ -159,7 +159,7 @@ def _choose(prims: list, mesh: str | None, path: Path):
     return prims[0]
 
 
-def _times(stage, geometry, Usd):
+def _times(stage: Any, geometry: Any, Usd: Any) -> tuple[list[Any], float | None]:
     samples = geometry.GetPointsAttr().GetTimeSamples()
     rate = stage.GetTimeCodesPerSecond()
     if stage.HasAuthoredTimeCodeRange():
@@ -171,7 +171,7 @@ def _times(stage, geometry, Usd):
     return [Usd.TimeCode.EarliestTime()], None
 
 
-def _world_points(geometry, UsdGeom, time) -> np.ndarray:
+def _world_points(geometry: Any, UsdGeom: Any, time: Any) -> np.ndarray:
     points = np.array(geometry.GetPointsAttr().Get(time) or [], dtype=np.float64).reshape(-1, 3)
     matrix = np.array(UsdGeom.Imageable(geometry).ComputeLocalToWorldTransform(time))
     return points @ matrix[:3, :3] + matrix[3, :3]

@@ -12,16 +12,23 @@ word, then for each frame its size in bytes (4 bytes, little endian) and its ver
 of zero. Everything Blender itself prints goes to the standard error.
 """
 
+from __future__ import annotations
+
 import contextlib
 import json
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MAGIC = b"warpgarment-frames 1\n"
 
 
-def own_output():
+def own_output() -> IO[bytes]:
     """The standard output for frames alone; whatever else is printed, by C code too, goes to the standard error."""
     mine = os.dup(1)
     os.dup2(2, 1)
@@ -29,7 +36,7 @@ def own_output():
 
 
 @contextlib.contextmanager
-def few_processors(count):
+def few_processors(count: int) -> Iterator[None]:
     """Holds this process to so many processors, where the system can; 0 for all."""
     allowed = os.sched_getaffinity(0) if count and hasattr(os, "sched_setaffinity") else None
     if allowed:
@@ -41,7 +48,7 @@ def few_processors(count):
             os.sched_setaffinity(0, allowed)
 
 
-def simulate(folder, sink):
+def simulate(folder: Path, sink: IO[bytes]) -> None:
     """Builds the scene in `folder` and writes its frames to `sink` as they come."""
     numbers = json.loads((folder / "scene.json").read_text())
     with few_processors(numbers["threads"]):
@@ -77,7 +84,7 @@ def simulate(folder, sink):
     sink.flush()
 
 
-def add_mesh(bpy, name, vertices, faces):
+def add_mesh(bpy: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
     """An object with a triangle mesh, in the scene."""
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(vertices.tolist(), [], faces.tolist())
@@ -87,13 +94,13 @@ def add_mesh(bpy, name, vertices, faces):
     return thing
 
 
-def follow(thing, path):
+def follow(thing: Any, path: Path) -> None:
     """Lets a mesh take its vertices from a PC2 file whose first sample is frame 1."""
     cache = thing.modifiers.new("path", "MESH_CACHE")
     cache.cache_format, cache.filepath, cache.frame_start = "PC2", str(path), 1.0
 
 
-def add_body(bpy, folder, arrays, numbers):
+def add_body(bpy: Any, folder: Path, arrays: dict[str, np.ndarray], numbers: dict[str, Any]) -> None:
     """The body: a mesh that follows its path and that cloth collides with, from outside only."""
     body = add_mesh(bpy, "body", arrays["body_first"], arrays["body_faces"])
     follow(body, folder / "body.pc2")
@@ -102,7 +109,7 @@ def add_body(bpy, folder, arrays, numbers):
         setattr(body.collision, name, value)
 
 
-def add_wind(bpy, wind):
+def add_wind(bpy: Any, wind: np.ndarray) -> None:
     """A wind along its own Z axis; rows are a unit direction, a strength and an air flow, one for every frame."""
     from mathutils import Vector
 
@@ -117,7 +124,7 @@ def add_wind(bpy, wind):
             fan.keyframe_insert(path, frame=frame)
 
 
-def add_cloth(bpy, folder, arrays, numbers):
+def add_cloth(bpy: Any, folder: Path, arrays: dict[str, np.ndarray], numbers: dict[str, Any]) -> Any:
     """All garments as one cloth, so that they collide with each other as a cloth does with itself."""
     cloth = add_mesh(bpy, "cloth", arrays["start"], arrays["faces"])
     for name in ("structural", "bending"):

@@ -214,7 +214,9 @@ class Worlds:
         ]
 
 
-def _world(newton: Any, scene: ClothScene, body_points: np.ndarray, body_faces: np.ndarray, settings: NewtonSettings):
+def _world(
+    newton: Any, scene: ClothScene, body_points: np.ndarray, body_faces: np.ndarray, settings: NewtonSettings
+) -> tuple[Any, Any]:
     """A builder that holds a scene, colored; and its body's mesh, None without a body."""
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
     for cloth in scene.cloths:
