@@ -86,7 +86,7 @@ class Compliance(NamedTuple):
         panels = np.concatenate([[0], np.cumsum(_pitch(sizes) // 16)])
         device_side = (torch.from_numpy(a).to(device) for a in (base, room, panels[:-1].astype(np.int32)))
         counts = int(needed), int((base >= 0).sum()), int(panels[-1])
-        return cls(*device_side, *counts, torch.from_numpy(local).to(device), values)
+        return cls._make((*device_side, *counts, torch.from_numpy(local).to(device), values))
 
 
 def _pitch(size: int | np.ndarray) -> int | np.ndarray:

@@ -122,7 +122,7 @@ class Factor(NamedTuple):
         host = (base, ends[:-1].astype(np.int32), order.astype(np.int32), pivot.astype(np.float64), triangle)
         counts = int((base >= 0).sum()), int((base < 0).sum()), explicit, int(ends[-1])
         arrays = (*host, *triangles[0], *triangles[1])
-        return cls(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays), *counts)
+        return cls._make((*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays), *counts))
 
     def without(self, load: torch.Tensor, vertex_component: torch.Tensor) -> torch.Tensor:
         """A load [V,3] with zeros on the components that have a factor."""

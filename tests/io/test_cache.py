@@ -137,7 +137,7 @@ def test_garments_keep_their_distances_on_disk(folder, monkeypatch):
     distances, pooled = first.geodesics, first.pooled_geodesics
     with monkeypatch.context() as patch:
         for name in ("geodesics.face_geodesics", "pooled_geodesics.pooled_geodesics"):
-            patch.setattr(f"warpgarment.{name}", lambda *_: pytest.fail("computed again"))
+            patch.setattr(f"warpgarment.geometry.{name}", lambda *_: pytest.fail("computed again"))
         np.testing.assert_array_equal(again.geodesics, distances)
         for a, b in zip(again.pooled_geodesics, pooled, strict=True):
             np.testing.assert_array_equal(a, b)
