@@ -10,7 +10,7 @@ import functools
 import os
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -27,7 +27,8 @@ from warpgarment.history import History
 from warpgarment.motion import GarmentMotion
 from warpgarment.network import GarmentNetwork
 from warpgarment.scene import Scene
-from warpgarment.state import SimulationState
+from warpgarment.state import SimulationState, Status, Vertices
+from warpgarment.status import RolloutStatus
 from warpgarment.timing import Timings
 
 
@@ -88,6 +89,32 @@ class Simulator:
         """
         return cls(checkpoint.load(checkpoint.find(name, device=device)), device, **options)
 
+    @overload
+    def rollout(
+        self,
+        garment: Garment,
+        body: BodyMotion | Sequence[BodyMotion],
+        *,
+        first_vertices: Any = None,
+        history: Any = None,
+        frames: int | None = None,
+        face_splits: int = 1,
+        progress: bool = False,
+    ) -> GarmentMotion: ...
+
+    @overload
+    def rollout(
+        self,
+        garment: Sequence[Garment],
+        body: BodyMotion | Sequence[BodyMotion],
+        *,
+        first_vertices: Any = None,
+        history: Any = None,
+        frames: int | None = None,
+        face_splits: int = 1,
+        progress: bool = False,
+    ) -> list[GarmentMotion]: ...
+
     def rollout(
         self,
         garment: Garment | Sequence[Garment],
@@ -98,7 +125,7 @@ class Simulator:
         frames: int | None = None,
         face_splits: int = 1,
         progress: bool = False,
-    ) -> Any:
+    ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
         Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
@@ -163,6 +190,22 @@ class Simulator:
             results.append(GarmentMotion(moved, worn.faces, self.network.config.fps, statuses, worn.name))
         return results[0] if single else results
 
+    @overload
+    def start(
+        self, garment: Garment, body_vertices: Any, body_faces: Any, *, first_vertices: Any = None, face_splits: int = 1
+    ) -> SimulationState[np.ndarray, RolloutStatus]: ...
+
+    @overload
+    def start(
+        self,
+        garment: Sequence[Garment],
+        body_vertices: Any,
+        body_faces: Any,
+        *,
+        first_vertices: Any = None,
+        face_splits: int = 1,
+    ) -> SimulationState[list[np.ndarray], list[RolloutStatus]]: ...
+
     def start(
         self,
         garment: Garment | Sequence[Garment],
@@ -171,7 +214,7 @@ class Simulator:
         *,
         first_vertices: Any = None,
         face_splits: int = 1,
-    ) -> SimulationState:
+    ) -> SimulationState[Any, Any]:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
         Args:
@@ -205,7 +248,9 @@ class Simulator:
         first = self._positions([b.vertices[0] for b in checked])
         return self._begin(garments, single, packed, known, [first], face_splits)[0]
 
-    def step(self, state: SimulationState, next_body_vertices: Any) -> SimulationState:
+    def step(
+        self, state: SimulationState[Vertices, Status], next_body_vertices: Any
+    ) -> SimulationState[Vertices, Status]:
         """One frame on.
 
         Args:
@@ -237,7 +282,7 @@ class Simulator:
         known: torch.Tensor,
         body_frames: list[torch.Tensor],
         face_splits: int,
-    ) -> list[SimulationState]:
+    ) -> list[SimulationState[Any, Any]]:
         """States of the known frames [K,V,3]: one for a cold start, H with a history."""
         scene = Scene(
             garments,
@@ -258,7 +303,7 @@ class Simulator:
             scene.graph = GraphedFrames(scene, functools.partial(advance, scene))
         finite = torch.ones(len(garments), dtype=torch.bool, device=self.device)
         unsolved = torch.zeros((2, 3), dtype=torch.float64, device=self.device)
-        states = []
+        states: list[SimulationState[Any, Any]] = []
         for frame, (vertices, body) in enumerate(zip(known, body_frames, strict=True)):
             if frame:
                 features = scene.features(known[frame - 1], body_frames[frame - 1], body)
@@ -270,7 +315,9 @@ class Simulator:
         return states
 
     @torch.inference_mode()
-    def _advance(self, state: SimulationState, next_body: torch.Tensor) -> SimulationState:
+    def _advance(
+        self, state: SimulationState[Vertices, Status], next_body: torch.Tensor
+    ) -> SimulationState[Vertices, Status]:
         scene = state.scene
         if scene.graph is None or self.timings.synchronise:
             after = advance(scene, state.now, next_body)
