@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import typing
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +14,24 @@ import torch
 from training_runs import config_for, entries_of, losses_of
 
 from warpgarment import checkpoint, differentiable
+from warpgarment.kernels.features import LAYOUT
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.network import ManifoldAwareTransformer, NetworkConfig, build_network
 from warpgarment.simulator import Simulator
 from warpgarment.training import interactions, train, unroll
 from warpgarment.training.augmentation import Augmentation
 from warpgarment.training.dataset import Sequence
+from warpgarment.training.drawing import Builder
 from warpgarment.training.losses import LossConfig
 from warpgarment.training.noise import NoiseConfig
 from warpgarment.training.objective import Objective
 from warpgarment.training.pushforward import PushforwardConfig
 from warpgarment.training.rollouts import predict
-from warpgarment.training.samples import SampleBuilder
+from warpgarment.training.samples import Batch, SampleBuilder
 from warpgarment.training.sequence_data import SequenceData
 from warpgarment.training.statistics import statistics
 from warpgarment.training.unroll import UnrollConfig, UnrolledObjective
-from warpgarment.training.unroll_samples import UnrolledBuilder
+from warpgarment.training.unroll_samples import UnrolledBatch, UnrolledBuilder
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.0, geodesic_radius=0.2)
 QUIET = NoiseConfig(position=0.0, offset=0.0)
@@ -275,6 +279,38 @@ def test_an_unrolled_loss_that_is_not_finite_stops_the_run(data, tmp_path, monke
     assert len(saved["sequence"]) == 2
     assert np.isnan(saved["recorded"][0, 0]).all()
     assert np.isfinite(saved["features"]).all()
+
+
+def test_both_builders_are_what_a_loader_needs(loaded, network):
+    """One builder is taken for the other, whose batches are of another type, or a loader calls what only one has."""
+    single, unrolled = SampleBuilder(loaded, SMALL, QUIET, PLAIN), UnrolledBuilder(loaded, network, QUIET, PLAIN, 3, 0)
+    assert not isinstance(unrolled, SampleBuilder)
+    for name in ("build", "reaches"):
+        wanted = inspect.signature(getattr(Builder, name))
+        for builder in (SampleBuilder, UnrolledBuilder):
+            assert inspect.signature(getattr(builder, name)).parameters == wanted.parameters
+    assert typing.get_type_hints(SampleBuilder.build)["return"] is Batch
+    assert typing.get_type_hints(UnrolledBuilder.build)["return"] is UnrolledBatch
+    for name in typing.get_type_hints(Builder):
+        assert getattr(single, name) == getattr(unrolled, name), name
+
+
+@pytest.mark.parametrize("t", [0, 2, T])
+def test_both_begin_with_the_same_history(loaded, network, t):
+    """Unrolled training starts from another history than training of one step: in frames before the first, in what a
+    rollout did wrong, or with a body that is not at rest there. What no turn changes, to 1e-5: float32."""
+    shift = np.random.default_rng(2).normal(0.0, 0.01, (2, *loaded[0].vertices[0].shape)).astype(np.float32)
+    arguments = [(0, t)], len(loaded[0].faces), np.random.default_rng(4), [shift]
+    one = SampleBuilder(loaded, SMALL, QUIET, PLAIN).build(*arguments)
+    several = UnrolledBuilder(loaded, network, QUIET, PLAIN, 1, 0).build(*arguments)
+    speeds = [v.reshape(-1, SMALL.history - 1, 3).norm(dim=2) for v in (one.velocities, several.history.velocities)]
+    torch.testing.assert_close(*speeds, rtol=0, atol=1e-5)
+    assert (speeds[0][:, -1] > 1e-3).all() == (t > 0)  # the shift; in frame 0 that of all frames before it
+    features = one.features[0], several.history.stacked(several.features).flatten(1)
+    features = [part.unflatten(1, (SMALL.history, -1)) for part in features]
+    for name in ("singular_values", "body_velocity", "body_deformation"):
+        lengths = [part[..., LAYOUT[name]].norm(dim=2) for part in features]
+        torch.testing.assert_close(*lengths, rtol=0, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_samples_end_where_the_recording_does(loaded, network):

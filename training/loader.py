@@ -9,12 +9,15 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
 
+from warpgarment.training.drawing import Builder
 from warpgarment.training.pushforward import Pool
-from warpgarment.training.samples import Batch, SampleBuilder
+
+Batch = TypeVar("Batch")
 
 
 class Plan:
@@ -49,7 +52,7 @@ class Plan:
         return [(int(s), int(t)) for s, t in self._order[step % self.batches]]
 
 
-class Loader:
+class Loader(Generic[Batch]):
     """Builds the batches of steps, in a thread of its own, `depth` ahead.
 
     Args:
@@ -65,7 +68,7 @@ class Loader:
 
     def __init__(
         self,
-        builder: SampleBuilder,
+        builder: Builder[Batch],
         plan: Plan,
         pool: Pool,
         share: float,
@@ -146,7 +149,7 @@ class Loader:
             thread.join()
 
 
-def _adopt(batch: Batch, built: torch.cuda.Event) -> None:
+def _adopt(batch: Any, built: torch.cuda.Event) -> None:
     """Makes the current stream wait for a batch of another one, and its memory wait for the current stream."""
     stream = torch.cuda.current_stream(batch.features.device)
     stream.wait_event(built)

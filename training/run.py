@@ -16,6 +16,7 @@ from warpgarment import checkpoint
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.training import state as training_state
 from warpgarment.training.distributed import Group
+from warpgarment.training.drawing import Builder
 from warpgarment.training.loader import Loader, Plan
 from warpgarment.training.objective import Objective, Trainer
 from warpgarment.training.pushforward import Pool
@@ -57,10 +58,11 @@ class Run:
         self.out, self.group, self.device = Path(config.out), group, group.device
         self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
         steps, passes, ahead = config.unroll.steps, config.unroll.collision_passes, config.ahead
+        chosen: Builder[Batch | UnrolledBatch] = builder
         if steps > 1:
-            builder = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
+            chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
             ahead = 0  # a scene's solvers belong to one thread
-        self.loader = Loader(builder, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
+        self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True

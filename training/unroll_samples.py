@@ -22,10 +22,10 @@ from warpgarment.network import ManifoldAwareTransformer
 from warpgarment.scene import Scene
 from warpgarment.timing import Timings
 from warpgarment.training.augmentation import Augmentation
+from warpgarment.training.drawing import Past, displacement, part_of, rest
 from warpgarment.training.flops import work
-from warpgarment.training.interactions import COLUMNS, unpack
+from warpgarment.training.interactions import unpack
 from warpgarment.training.noise import NoiseConfig
-from warpgarment.training.samples import SampleBuilder
 from warpgarment.training.sequence_data import SequenceData
 
 _VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
@@ -82,8 +82,8 @@ def turned(
     return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
 
 
-class UnrolledBuilder(SampleBuilder):
-    """Builds batches for unrolled training; takes the place of `SampleBuilder` in a loader.
+class UnrolledBuilder:
+    """Builds batches for unrolled training.
 
     Args:
         sequences: Training sequences.
@@ -103,8 +103,11 @@ class UnrolledBuilder(SampleBuilder):
         steps: int,
         collision_passes: int,
     ) -> None:
-        super().__init__(sequences, network.config, noise, augmentation)
-        self.module, self.steps, self.collision_passes = network, steps, collision_passes
+        self.sequences, self.network = sequences, network
+        self.noise, self.augmentation = noise, augmentation
+        self.device = sequences[0].device
+        self.patches = network.config.architecture == "patches"
+        self.steps, self.collision_passes = steps, collision_passes
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether all K frames after a frame are recorded."""
@@ -121,27 +124,24 @@ class UnrolledBuilder(SampleBuilder):
     ) -> UnrolledBatch:
         """Builds one batch, or a part of it; as `SampleBuilder.build`, but that all faces are there, and the network
         sees them in subsets of about `faces` (None: all at once)."""
-        streams = rng.spawn(len(picks))[part]
         total = sum(self.sequences[s].components for s, _ in picks) / len(picks)
-        picks = picks[part]
-        displacements = displacements[part] if displacements else [None] * len(picks)
-        history, device = self.network.history, self.device
+        picks, streams, overrides = part_of(picks, rng, displacements, part)
+        history, device = self.network.config.history, self.device
         mine = [self.sequences[s] for s, _ in picks]
         face_splits = 1 if faces is None else max(round(min(len(data.faces) for data in mine) / faces), 1)
 
         past, rows, bodies = [], [], []
-        for (_, t), data, stream, override in zip(picks, mine, streams, displacements, strict=True):
-            frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
-            delta, early = self.displacement(data, stream, override), max(history - 1 - t, 0)
-            moved = data.vertices[frames]
-            if delta is not None:  # frames before the first repeat it, displaced as it is
-                moved = moved + torch.from_numpy(delta[np.maximum(np.arange(history), early)]).to(device)
-            seen = data.interaction[frames].clone()  # [H,F,16]
-            seen[:early, :, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
-            seen[:early, :, COLUMNS["velocity"]] = 0.0
+        for (_, t), data, stream, override in zip(picks, mine, streams, overrides, strict=True):
+            begins = Past.of(t, history, device)
+            delta = displacement(data, history, self.noise, stream, override)
+            moved = data.vertices[begins.frames]
+            if delta is not None:
+                moved = moved + torch.from_numpy(begins.held(delta)).to(device)
+            seen = data.interaction[begins.frames].clone()  # [H,F,16]
+            rest(seen[: begins.early])
             past.append(moved)
             rows.append(seen)
-            bodies.append(data.body_frames([int(frames[0]), *range(t, t + self.steps + 1)]))
+            bodies.append(data.body_frames([int(begins.frames[0]), *range(t, t + self.steps + 1)]))
         recorded = [
             torch.cat([data.vertices[t + k] for (_, t), data in zip(picks, mine, strict=True)])
             for k in range(1, self.steps + 1)
@@ -154,7 +154,7 @@ class UnrolledBuilder(SampleBuilder):
             PackedBodies.pack([f for _, f in bodies], [v.shape[1] for v, _ in bodies], range(len(picks)), device),
             placed[0],
             torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)]),
-            self.module,
+            self.network,
             face_splits=face_splits,
             epsilon=None,
             collision_passes=self.collision_passes,
@@ -184,7 +184,7 @@ class UnrolledBuilder(SampleBuilder):
     def _symmetries(self, streams: list[np.random.Generator]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Per sample: turn of what the network sees [B,3,3], the part that the rest pose shares, whether mirrored."""
         settings = self.augmentation
-        free = settings.world_yaw and self.network.heading == "world"
+        free = settings.world_yaw and self.network.config.heading == "world"
         angles, mirrored = np.zeros((2, len(streams)), np.float32), np.zeros(len(streams), bool)
         for b, rng in enumerate(streams):
             angles[1, b] = rng.standard_normal() * np.radians(settings.yaw)
