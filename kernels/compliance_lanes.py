@@ -113,15 +113,13 @@ def solve_contacts(
                 k += stride
             rr_next = cg.block_sum(rr_next)
 
-            beta = rr_next / rr
+            beta, total, running = cg.after_step(rr, rr_next, alpha, total, goal, relative)
             k = lane
             while k < count:
                 direction[first + k] = residual[first + k] + beta * direction[first + k]
                 k += stride
 
-            total += alpha * rr
             iteration += 1
-            running = rr_next > wp.max(goal, relative * relative * total)
             rr = cg.block_sum(rr_next) / wp.float64(stride)  # the barrier between direction and the next product
 
         if not (rr >= zero):  # NaN in, NaN out
