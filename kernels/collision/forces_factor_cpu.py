@@ -25,6 +25,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.linear.triangular import eliminate, padded, substitute_back, substitution
@@ -135,13 +136,11 @@ def contact_forces(
                 left = residual[first + m] - alpha * image[first + m]
                 residual[first + m] = left
                 rr_next += left * left
-            beta = rr_next / rr
+            beta, total, running = after_step(rr, rr_next, alpha, total, goal, relative)
             for m in range(count):
                 direction[first + m] = residual[first + m] + beta * direction[first + m]
-            total += alpha * rr
             rr = rr_next
             iteration += 1
-            running = rr > wp.max(goal, relative * relative * total)
         if not (rr >= zero):  # NaN in, NaN out
             for m in range(count):
                 solution[first + m] = rr

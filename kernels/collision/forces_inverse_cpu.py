@@ -20,6 +20,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.operator import allocate
 
@@ -156,13 +157,11 @@ def wide_contacts(
                 rest = residual[first + m] - alpha * (p + wp.float64(image[front + m / 16][m % 16]))
                 residual[first + m] = rest
                 rr_next += rest * rest
-            beta = rr_next / rr
+            beta, total, running = after_step(rr, rr_next, alpha, total, goal, relative)
             for m in range(count):
                 direction[first + m] = residual[first + m] + beta * direction[first + m]
-            total += alpha * rr
             rr = rr_next
             iteration += 1
-            running = rr > wp.max(goal, relative * relative * total)
         if not (rr >= zero):  # NaN in, NaN out
             for m in range(count):
                 solution[first + m] = rr

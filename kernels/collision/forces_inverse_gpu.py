@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.system import System, block_dim, block_sum
 from warpgarment.kernels.operator import allocate
 
@@ -114,15 +115,13 @@ def solve_contacts(
                 k += stride
             rr_next = block_sum(rr_next)
 
-            beta = rr_next / rr
+            beta, total, running = after_step(rr, rr_next, alpha, total, goal, relative)
             k = lane
             while k < count:
                 direction[first + k] = residual[first + k] + beta * direction[first + k]
                 k += stride
 
-            total += alpha * rr
             iteration += 1
-            running = rr_next > wp.max(goal, relative * relative * total)
             rr = block_sum(rr_next) / wp.float64(stride)  # the barrier between direction and the next product
 
         if not (rr >= zero):  # NaN in, NaN out

@@ -44,6 +44,32 @@ def precondition(s: wp.float64, n: wp.vec3d, r: wp.vec3d) -> wp.vec3d:
     return z
 
 
+@wp.func
+def after_step(
+    rr: wp.float64,
+    rr_next: wp.float64,
+    alpha: wp.float64,
+    total: wp.float64,
+    goal: wp.float64,
+    relative: wp.float64,
+):
+    """The scalars of conjugate gradients after a step, where the residual bounds the error (compliance.py).
+
+    Args:
+        rr: Squared residual before the step.
+        rr_next: After it.
+        alpha: Length of the step.
+        total: Energy of the solution before the step.
+        goal: Square of the residual where the iteration stops.
+        relative: The same as a share of the energy norm of the solution, not squared; the looser of the two holds.
+
+    Returns:
+        β, which the direction is kept with; energy of the solution after the step; whether the iteration goes on.
+    """
+    energy = total + alpha * rr
+    return rr_next / rr, energy, rr_next > wp.max(goal, relative * relative * energy)
+
+
 @wp.kernel(enable_backward=False)
 def conjugate_gradients(
     # System:

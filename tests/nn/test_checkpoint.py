@@ -111,6 +111,22 @@ def test_foreign_files(tmp_path):
         checkpoint.load(other)
 
 
+def test_checkpoints_made_before(file):
+    """Networks that were saved when `format` said what `kind` says now could no longer be loaded."""
+
+    def older(header):
+        header["__metadata__"].pop("kind")
+        header["__metadata__"]["format"] = "warpgarment.network"
+
+    wanted = checkpoint.load(file).state_dict()
+    rewrite(file, older)
+    for name, tensor in checkpoint.load(file).state_dict().items():
+        assert torch.equal(tensor, wanted[name])
+    rewrite(file, lambda header: header["__metadata__"].update(format="pt"))
+    with pytest.raises(CheckpointError, match="no warpgarment network"):
+        checkpoint.load(file)
+
+
 def test_newer_version(file):
     """A file of a later format would be misread."""
     rewrite(file, lambda header: header["__metadata__"].update(format_version="99"))

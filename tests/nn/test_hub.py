@@ -172,3 +172,20 @@ def test_only_data_is_asked_for():
     assert allowed == [
         "model.safetensors", "model-00001-of-00002.safetensors", "model.safetensors.index.json", "README.md",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("shard", "files"), [(14_000, 4), (2**20, 1)])
+def test_the_hubs_own_tools_read_a_folder(tmp_path, shard, files):
+    """A published network opens here alone: the index, the names or the headers of its shards are not those that other
+    programs expect. Bit for bit, by the loader of huggingface-hub (extra `hub`), with no key missing or left over."""
+    theirs = pytest.importorskip("huggingface_hub")
+    ours, other = network(5), network(6)
+    written = checkpoint.save(ours, tmp_path / "net", max_shard_bytes=shard)
+    assert len(list((tmp_path / "net").iterdir())) == files, written
+    theirs.load_torch_model(other, tmp_path / "net", strict=True)
+    for name, tensor in ours.state_dict().items():
+        assert torch.equal(other.state_dict()[name], tensor), name
+    found = {}
+    for path in sorted((tmp_path / "net").glob("*.safetensors")):
+        found |= theirs.load_state_dict_from_file(path)
+    assert set(found) == set(ours.state_dict())

@@ -90,7 +90,7 @@ def test_layout_is_that_of_hugging_face(folder):
     for file in files:
         with safe_open(file, framework="pt") as opened:
             metadata = opened.metadata()
-        assert metadata["format"] == checkpoint.FORMAT
+        assert (metadata["kind"], metadata["format"]) == (checkpoint.KIND, "pt")
         assert json.loads(metadata["config"])["embedding"] == 16
         assert json.loads(metadata["notes"]) == {"steps": 12}
 

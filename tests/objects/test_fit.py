@@ -132,3 +132,17 @@ def test_two_different_bodies_are_refused():
         wg.fit(GARMENT, vertices, vertices)
     with pytest.raises(wg.MeshError, match="NaN"):
         wg.fit(GARMENT, (vertices, faces), vertices * np.nan)
+
+
+def test_no_epsilon_is_the_clearance_that_simulations_keep():
+    """A coarse garment starts nearer to the body than its simulation keeps it, and jumps in the first frame. Against
+    signed distances of libigl, to 0.1 mm: contacts of `fit` are soft, then moved out exactly, in float32."""
+    coarse = wg.Garment(*tube(0.152, -0.45, 0.45, around=14, rows=7))
+    i, j = coarse.edges.T
+    edge = np.linalg.norm(coarse.vertices[i] - coarse.vertices[j], axis=1).mean()
+    assert 0.2 * edge > 0.008, "coarse enough to matter"
+    bent = bend(BODY[0], 0.5).astype(np.float32)
+    free = wg.fit(coarse, BODY, bent, epsilon=None)
+    assert signed_distance(free, bent, BODY[1]).min() > 0.2 * edge - 1e-4
+    np.testing.assert_array_equal(wg.fit(coarse, BODY, bent), wg.fit(coarse, BODY, bent, epsilon=0.004))
+    assert signed_distance(wg.fit(coarse, BODY, bent), bent, BODY[1]).min() < 0.2 * edge - 1e-3

@@ -9,35 +9,15 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Iterator
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
 
+from .drawing import Builder
 from .pushforward import Pool
-from .single_step import Batch
 
-Built = TypeVar("Built", covariant=True)
-
-
-class Builder(Protocol[Built]):
-    """What builds the batches of a loader: `SampleBuilder`, or `UnrolledBuilder` for several steps in a row."""
-
-    device: torch.device
-    patches: bool
-
-    def reaches(self, sequence: int, newest: int) -> bool:
-        """Whether the recorded frames that a sample needs follow a frame."""
-
-    def build(
-        self,
-        picks: list[tuple[int, int]],
-        faces: int | None,
-        rng: np.random.Generator,
-        displacements: list[np.ndarray | None] | None = None,
-        part: slice = slice(None),
-    ) -> Built:
-        """See `SampleBuilder.build`."""
+Batch = TypeVar("Batch")
 
 
 class Plan:
@@ -72,7 +52,7 @@ class Plan:
         return [(int(s), int(t)) for s, t in self._order[step % self.batches]]
 
 
-class Loader(Generic[Built]):
+class Loader(Generic[Batch]):
     """Builds the batches of steps, in a thread of its own, `depth` ahead.
 
     Args:
@@ -88,7 +68,7 @@ class Loader(Generic[Built]):
 
     def __init__(
         self,
-        builder: Builder[Built],
+        builder: Builder[Batch],
         plan: Plan,
         pool: Pool,
         share: float,
@@ -101,7 +81,7 @@ class Loader(Generic[Built]):
         # A stream of its own: what a batch waits for is not the training step, nor the other way round
         self._stream = torch.cuda.Stream(builder.device) if builder.device.type == "cuda" else None
 
-    def build(self, step: int, *, splits: int | None = None, part: slice | None = None) -> Built:
+    def build(self, step: int, *, splits: int | None = None, part: slice | None = None) -> Batch:
         """The batch of a step; `splits` and `part` override the schedule's and the process's."""
         rng = np.random.default_rng((self.plan.seed, 1, step))
         picks = self.plan.picks(step)
@@ -124,7 +104,7 @@ class Loader(Generic[Built]):
         """Whether enough recorded frames follow a frame of the pool."""
         return self.builder.reaches(*self.pool.entry(rollout, last)[:2])
 
-    def batches(self, start: int, stop: int) -> Iterator[Built]:
+    def batches(self, start: int, stop: int) -> Iterator[Batch]:
         """The batches of steps start..stop-1, in order."""
         if self.depth == 0:
             yield from map(self.build, range(start, stop))
@@ -134,7 +114,7 @@ class Loader(Generic[Built]):
         ready: queue.Queue = queue.Queue(maxsize=self.depth)
         stopped = threading.Event()
 
-        def hand_over(item: tuple[Built, torch.cuda.Event | None] | BaseException) -> bool:
+        def hand_over(item: tuple[Batch, torch.cuda.Event | None] | BaseException) -> bool:
             while not stopped.is_set():
                 try:
                     ready.put(item, timeout=0.2)
@@ -169,7 +149,7 @@ class Loader(Generic[Built]):
             thread.join()
 
 
-def _adopt(batch: Batch, built: torch.cuda.Event) -> None:
+def _adopt(batch: Any, built: torch.cuda.Event) -> None:
     """Makes the current stream wait for a batch of another one, and its memory wait for the current stream."""
     stream = torch.cuda.current_stream(batch.features.device)
     stream.wait_event(built)

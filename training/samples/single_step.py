@@ -12,8 +12,6 @@ so the answer leads back to the recorded motion. A batch is built with one launc
 and frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but
 components. A network of patches is shown neighbours where the faces are not a subset: then whole garments make a batch,
 padded with copies of a face that do not count.
-
-Every sample has a stream of random numbers of its own, so that a part of a batch is the same part whoever builds it.
 """
 
 from __future__ import annotations
@@ -23,9 +21,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
-from warpgarment.kernels.deformation.svd import singular_values
-from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.deformation import (
+    deformation_gradient_from_inverse,
+    relative_deformation_gradient,
+    singular_values,
+)
+from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
@@ -33,6 +34,7 @@ from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.nn.patches.layout import Patches, PatchLayout, patch_layout
 
 from .augmentation import Augmentation, mirror
+from .drawing import Past, displacement, part_of, rest
 from .interactions import COLUMNS, unpack
 from .noise import NoiseConfig
 from .recorded import SequenceData
@@ -66,12 +68,12 @@ class Batch(NamedTuple):
         return {name: tensor.cpu().numpy() for name, tensor in (tensors | self.target._asdict()).items()}
 
 
-class HistoryBuilder:
-    """What the builders of batches have in common: their settings, and how a history is displaced.
+class SampleBuilder:
+    """Builds batches.
 
     Args:
         sequences: Training sequences.
-        network: Their `NetworkConfig`.
+        network: Config of the network that is trained.
         noise: Perturbation of histories.
         augmentation: Mirror, turns and sizes.
     """
@@ -87,28 +89,6 @@ class HistoryBuilder:
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the recorded frames that a sample needs follow a frame."""
         return newest < self.sequences[sequence].count
-
-    def displacement(
-        self, sequence: SequenceData, rng: np.random.Generator, override: np.ndarray | None
-    ) -> np.ndarray | None:
-        """[history,V,3]: noise plus the override of the newest frames; None where there is neither."""
-        delta = sequence.noise.displacement(self.network.history, self.noise, rng)
-        if override is not None:
-            if delta is None:
-                delta = np.zeros((self.network.history, *override.shape[1:]), np.float32)
-            delta[-len(override) :] += override
-        return delta
-
-
-class SampleBuilder(HistoryBuilder):
-    """Builds batches.
-
-    Args:
-        sequences: Training sequences.
-        network: Their `NetworkConfig`.
-        noise: Perturbation of histories.
-        augmentation: Mirror, turns and sizes.
-    """
 
     @torch.no_grad()
     def build(
@@ -134,9 +114,9 @@ class SampleBuilder(HistoryBuilder):
             The batch, on the sequences' device.
         """
         all_faces = sum(len(self.sequences[s].faces) if faces is None else faces for s, _ in picks)
-        streams, whole = rng.spawn(len(picks))[part], [self.sequences[s].components for s, _ in picks]
-        picks, real = picks[part], whole[part]
-        displacements = displacements[part] if displacements else [None] * len(picks)
+        whole = [self.sequences[s].components for s, _ in picks]
+        picks, streams, overrides = part_of(picks, rng, displacements, part)
+        real = whole[part]
         history, device, count, components = self.network.history, self.device, len(picks), max(real)
         sizes = [len(self.sequences[s].faces) if faces is None else faces for s, _ in picks]
         whole_garments, faces = faces is None, max(sizes)
@@ -164,12 +144,11 @@ class SampleBuilder(HistoryBuilder):
             if weights is not None:
                 weights[b] = sequence.weights(subset, scale[b])
             seen = self._send(subset)
-            frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
-            past = sequence.vertices[frames]
-            delta = self.displacement(sequence, rng, displacements[b])
+            begins = Past.of(t, history, device)
+            past = sequence.vertices[begins.frames]
+            delta = displacement(sequence, history, self.noise, rng, overrides[b])
             if delta is not None:
-                first = max(history - 1 - t, 0)  # frames before the first repeat it, displaced as it is
-                past = past + self._send(delta[np.maximum(np.arange(history), first)])
+                past = past + self._send(begins.held(delta))
             mean = sequence.garment_weights @ past[-1]
             origin[b] = mean
             past = (past - mean) @ similarity[b].mT
@@ -178,11 +157,8 @@ class SampleBuilder(HistoryBuilder):
             velocities[b, : sequence.components] = (centres[1:] - centres[:-1]).transpose(0, 1).flatten(1)
             velocity[b, : sequence.components] = sequence.component_weights @ after - centres[-1]
             body_velocity[b, : sequence.components] = sequence.body_velocity[t] @ similarity[b].mT
-            rows[b] = sequence.interaction[frames[None, :], seen[:, None]]
-            early = max(history - 1 - t, 0)
-            if early:
-                rows[b, :, :early, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
-                rows[b, :, :early, COLUMNS["velocity"]] = 0.0
+            rows[b] = sequence.interaction[begins.frames[None, :], seen[:, None]]
+            rest(rows[b, :, : begins.early])
             inverse_rest[b] = sequence.inverse_rest[seen]
             chosen, vertices = sequence.faces[seen], past.shape[1]
             steps = torch.arange(history, dtype=torch.int32, device=device) * vertices + start

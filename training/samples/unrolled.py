@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
-from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.deformation import face_centroids, segment_mean
+from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
@@ -24,10 +24,10 @@ from warpgarment.sim.scene import Scene
 from warpgarment.sim.timing import Timings
 
 from .augmentation import Augmentation
-from .interactions import COLUMNS, unpack
+from .drawing import Past, displacement, part_of, rest
+from .interactions import unpack
 from .noise import NoiseConfig
 from .recorded import SequenceData
-from .single_step import HistoryBuilder
 
 _VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
 
@@ -83,8 +83,8 @@ def turned(
     return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
 
 
-class UnrolledBuilder(HistoryBuilder):
-    """Builds batches for unrolled training; takes the place of `SampleBuilder` in a loader.
+class UnrolledBuilder:
+    """Builds batches for unrolled training.
 
     Args:
         sequences: Training sequences.
@@ -104,8 +104,11 @@ class UnrolledBuilder(HistoryBuilder):
         steps: int,
         collision_passes: int,
     ) -> None:
-        super().__init__(sequences, network.config, noise, augmentation)
-        self.module, self.steps, self.collision_passes = network, steps, collision_passes
+        self.sequences, self.network = sequences, network
+        self.noise, self.augmentation = noise, augmentation
+        self.device = sequences[0].device
+        self.patches = network.config.architecture == "patches"
+        self.steps, self.collision_passes = steps, collision_passes
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether all K frames after a frame are recorded."""
@@ -122,27 +125,24 @@ class UnrolledBuilder(HistoryBuilder):
     ) -> UnrolledBatch:
         """Builds one batch, or a part of it; as `SampleBuilder.build`, but that all faces are there, and the network
         sees them in subsets of about `faces` (None: all at once)."""
-        streams = rng.spawn(len(picks))[part]
         total = sum(self.sequences[s].components for s, _ in picks) / len(picks)
-        picks = picks[part]
-        displacements = displacements[part] if displacements else [None] * len(picks)
-        history, device = self.network.history, self.device
+        picks, streams, overrides = part_of(picks, rng, displacements, part)
+        history, device = self.network.config.history, self.device
         mine = [self.sequences[s] for s, _ in picks]
         face_splits = 1 if faces is None else max(round(min(len(data.faces) for data in mine) / faces), 1)
 
         past, rows, bodies = [], [], []
-        for (_, t), data, stream, override in zip(picks, mine, streams, displacements, strict=True):
-            frames = torch.arange(t - history + 1, t + 1, device=device).clamp(min=0)
-            delta, early = self.displacement(data, stream, override), max(history - 1 - t, 0)
-            moved = data.vertices[frames]
-            if delta is not None:  # frames before the first repeat it, displaced as it is
-                moved = moved + torch.from_numpy(delta[np.maximum(np.arange(history), early)]).to(device)
-            seen = data.interaction[frames].clone()  # [H,F,16]
-            seen[:early, :, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
-            seen[:early, :, COLUMNS["velocity"]] = 0.0
+        for (_, t), data, stream, override in zip(picks, mine, streams, overrides, strict=True):
+            begins = Past.of(t, history, device)
+            delta = displacement(data, history, self.noise, stream, override)
+            moved = data.vertices[begins.frames]
+            if delta is not None:
+                moved = moved + torch.from_numpy(begins.held(delta)).to(device)
+            seen = data.interaction[begins.frames].clone()  # [H,F,16]
+            rest(seen[: begins.early])
             past.append(moved)
             rows.append(seen)
-            bodies.append(data.body_frames([int(frames[0]), *range(t, t + self.steps + 1)]))
+            bodies.append(data.body_frames([int(begins.frames[0]), *range(t, t + self.steps + 1)]))
         recorded = [
             torch.cat([data.vertices[t + k] for (_, t), data in zip(picks, mine, strict=True)])
             for k in range(1, self.steps + 1)
@@ -155,7 +155,7 @@ class UnrolledBuilder(HistoryBuilder):
             PackedBodies.pack([f for _, f in bodies], [v.shape[1] for v, _ in bodies], range(len(picks)), device),
             placed[0],
             torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)]),
-            self.module,
+            self.network,
             face_splits=face_splits,
             epsilon=None,
             collision_passes=self.collision_passes,
@@ -185,7 +185,7 @@ class UnrolledBuilder(HistoryBuilder):
     def _symmetries(self, streams: list[np.random.Generator]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Per sample: turn of what the network sees [B,3,3], the part that the rest pose shares, whether mirrored."""
         settings = self.augmentation
-        free = settings.world_yaw and self.network.heading == "world"
+        free = settings.world_yaw and self.network.config.heading == "world"
         angles, mirrored = np.zeros((2, len(streams)), np.float32), np.zeros(len(streams), bool)
         for b, rng in enumerate(streams):
             angles[1, b] = rng.standard_normal() * np.radians(settings.yaw)

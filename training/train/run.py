@@ -19,6 +19,7 @@ from warpgarment.nn import checkpoint
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import predict
+from warpgarment.training.samples.drawing import Builder
 from warpgarment.training.samples.loader import Loader, Plan
 from warpgarment.training.samples.pushforward import Pool
 from warpgarment.training.samples.single_step import Batch, SampleBuilder
@@ -63,14 +64,12 @@ class Run:
         self.config, self.network, self.validation, self.began = config, network, validation, began
         self.out, self.group, self.device = Path(config.out), group, group.device
         self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
-        steps, passes, share = config.unroll.steps, config.unroll.collision_passes, config.pushforward.share
-        self.loader: Loader[Batch] | Loader[UnrolledBatch]
+        steps, passes, ahead = config.unroll.steps, config.unroll.collision_passes, config.ahead
+        chosen: Builder[Batch | UnrolledBatch] = builder
         if steps > 1:
-            unrolled = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
-            # built when asked for: a scene's solvers belong to one thread
-            self.loader = Loader(unrolled, plan, self.pool, share, self.splits, 0, part)
-        else:
-            self.loader = Loader(builder, plan, self.pool, share, self.splits, config.ahead, part)
+            chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
+            ahead = 0  # a scene's solvers belong to one thread
+        self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True

@@ -1,7 +1,8 @@
 """Checkpoints: safetensors that hold the weights, the statistics and, as JSON, the `NetworkConfig`.
 
-One file, or a folder of shards with an index (`shards.py`). Metadata keys: `format` ("warpgarment.network"),
-`format_version`, `config`, and `notes`, a JSON object for whatever a training run wants to say about itself. Nothing in
+One file, or a folder of shards with an index (`shards.py`). Metadata keys: `kind` ("warpgarment.network"),
+`format_version`, `config`, `notes`, a JSON object for whatever a training run wants to say about itself, and `format`
+("pt"), without which the Hugging Face Hub's tools refuse a file; older checkpoints have `kind` in its place. Nothing in
 a checkpoint is executed when it is read.
 """
 
@@ -25,7 +26,7 @@ from . import hub, shards
 from .config import NetworkConfig
 from .network import STATISTICS, GarmentNetwork
 
-FORMAT = "warpgarment.network"
+KIND = "warpgarment.network"
 FORMAT_VERSION = 1
 WEIGHTS = Path(__file__).parents[1] / "assets" / "weights"  # networks that ship with the package
 LATER = {  # settings that older checkpoints do not have: their default is how it was then
@@ -71,7 +72,8 @@ def save(
             raise CheckpointError(f"{name} is not finite in {str(dtype)[6:]}; nothing was written to {path}")
         tensors[name] = tensor
     metadata = {
-        "format": FORMAT,
+        "format": "pt",
+        "kind": KIND,
         "format_version": str(FORMAT_VERSION),
         "config": json.dumps(dataclasses.asdict(network.config)),
         "notes": json.dumps(dict(notes or {})),
@@ -175,8 +177,8 @@ def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> st
 
 def _described(contents: shards.Contents) -> tuple[NetworkConfig, dict[str, object]]:
     path, metadata = contents.path, contents.metadata
-    if metadata.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: a safetensors file, but no warpgarment network (format {FORMAT!r} is missing)")
+    if metadata.get("kind", metadata.get("format")) != KIND:
+        raise CheckpointError(f"{path}: a safetensors file, but no warpgarment network (kind {KIND!r} is missing)")
     version = metadata.get("format_version", "")
     if version != str(FORMAT_VERSION):
         raise CheckpointError(

@@ -17,6 +17,7 @@ from warpgarment.kernels.mesh.laplacian import half_cotangents
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from .body import BodyMotion
+from .clearance import clearance as least_clearance
 from .garment import Garment
 
 NEAREST = 48  # body faces that a garment vertex listens to
@@ -27,7 +28,7 @@ ROUNDS = 12  # local-global rounds
 MOST_CLEARANCE = 0.02  # clearance of the rest pose beyond this is not kept [m]
 
 
-def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float = 0.004) -> np.ndarray:
+def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float | None = 0.004) -> np.ndarray:
     """The garment's vertices in the first frame of a motion, given the body it was modelled on.
 
     1. Each garment vertex takes a blend of the rigid motions rest -> first of its nearest body faces, weighted by
@@ -46,7 +47,8 @@ def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float = 0
         body_rest: The body the garment was modelled on: `(vertices [U,3], faces [G,3])`, or a BodyMotion, whose first
             frame counts.
         body_first: The same body in the first frame: positions [m], shape [U,3], or as `body_rest`.
-        epsilon: Least distance to the body [m].
+        epsilon: Least distance to the body [m]. None: what a simulator keeps by default, 4 mm, or a fifth of the
+            garment's mean edge length if that is more.
 
     Returns:
         Positions [m], float32, shape [V,3].
@@ -54,6 +56,7 @@ def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float = 0
     Raises:
         MeshError: The two bodies differ in vertices or faces, or one is not a mesh.
     """
+    epsilon = least_clearance(garment) if epsilon is None else epsilon
     rest, faces = _body(body_rest, None, "body_rest")
     first, _ = _body(body_first, faces, "body_first")
     if first.shape != rest.shape:

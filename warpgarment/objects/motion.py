@@ -55,7 +55,7 @@ class GarmentMotion:
     def save(self, path: str | os.PathLike) -> None:
         """Writes the motion, completely or not at all.
 
-        - ``.npz``: positions, faces, rate and status; `load` reads it back without loss;
+        - ``.npz``: positions, faces, rate, status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample a frame (extra ``usd``), Y up, metres;
         - ``.pc2``: Blender's and others' point cache, with the first frame as ``.obj`` of the same name beside it;
         - no suffix: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is replaced if it
@@ -76,17 +76,35 @@ class GarmentMotion:
         )
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> GarmentMotion:
-        """Reads what `save` wrote as .npz.
+    def load(
+        cls, path: str | os.PathLike, *, unit: str | None = None, fps: float | None = None, mesh: str | None = None
+    ) -> GarmentMotion:
+        """Reads what `save` wrote, in any of its formats; only .npz keeps the statuses and the name.
+
+        Args:
+            path: File or folder.
+            unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that USD files
+                are converted by their own `metersPerUnit` and `upAxis`.
+            fps: Overrides the file's rate; 30 where neither says, as .pc2 and folders of .obj do not.
+            mesh: Name of the mesh to read where a USD file holds several.
 
         Raises:
             MeshError: Not such a file.
             FileNotFoundError: There is no such file.
         """
+        from warpgarment.io.mesh import scale_of
         from warpgarment.io.npz import read_npz
+        from warpgarment.io.sequence import read_sequence
 
         path = Path(path)
-        data = read_npz(path, required=("vertices", "faces", "fps"))
+        if path.suffix.lower() != ".npz":
+            found = read_sequence(path, unit=unit, mesh=mesh)
+            rate = fps if fps is not None else found.fps if found.fps is not None else 30.0
+            try:
+                return cls(found.vertices, found.faces, rate, name=path.stem)
+            except MeshError as error:
+                raise MeshError(f"{path}: {error}") from None
+        scale, data = scale_of(unit), read_npz(path, required=("vertices", "faces", "fps"))
         try:
             status: list[RolloutStatus] = []
             if "status_finite" in data:
@@ -95,7 +113,8 @@ class GarmentMotion:
                 rows = zip(*columns, verdicts, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
             name = str(data["name"]) if "name" in data else path.stem
-            return cls(data["vertices"], data["faces"], float(data["fps"]), status, name)
+            vertices = data["vertices"] if scale == 1.0 else np.asarray(data["vertices"], np.float64) * scale
+            return cls(vertices, data["faces"], float(data["fps"]) if fps is None else fps, status, name)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
 

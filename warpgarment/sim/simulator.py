@@ -10,7 +10,7 @@ import functools
 import os
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.pack import PackedBodies
+from warpgarment.objects.status import RolloutStatus
 
 from .advance import advance
 from .arguments import as_array, counted, known_frames, listed, per_garment
@@ -30,7 +31,7 @@ from .graph import GraphedFrames
 from .history import History
 from .recording import READ_EVERY, Recording
 from .scene import Scene
-from .state import SimulationState
+from .state import SimulationState, Status, Vertices
 from .timing import Timings
 
 
@@ -91,6 +92,32 @@ class Simulator:
         """
         return cls(checkpoint.load(checkpoint.find(name, device=device)), device, **options)
 
+    @overload
+    def rollout(
+        self,
+        garment: Garment,
+        body: BodyMotion | Sequence[BodyMotion],
+        *,
+        first_vertices: Any = None,
+        history: Any = None,
+        frames: int | None = None,
+        face_splits: int = 1,
+        progress: bool = False,
+    ) -> GarmentMotion: ...
+
+    @overload
+    def rollout(
+        self,
+        garment: Sequence[Garment],
+        body: BodyMotion | Sequence[BodyMotion],
+        *,
+        first_vertices: Any = None,
+        history: Any = None,
+        frames: int | None = None,
+        face_splits: int = 1,
+        progress: bool = False,
+    ) -> list[GarmentMotion]: ...
+
     def rollout(
         self,
         garment: Garment | Sequence[Garment],
@@ -101,7 +128,7 @@ class Simulator:
         frames: int | None = None,
         face_splits: int = 1,
         progress: bool = False,
-    ) -> Any:
+    ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
         Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
@@ -166,6 +193,22 @@ class Simulator:
             results.append(GarmentMotion(moved, worn.faces, self.network.config.fps, statuses, worn.name))
         return results[0] if single else results
 
+    @overload
+    def start(
+        self, garment: Garment, body_vertices: Any, body_faces: Any, *, first_vertices: Any = None, face_splits: int = 1
+    ) -> SimulationState[np.ndarray, RolloutStatus]: ...
+
+    @overload
+    def start(
+        self,
+        garment: Sequence[Garment],
+        body_vertices: Any,
+        body_faces: Any,
+        *,
+        first_vertices: Any = None,
+        face_splits: int = 1,
+    ) -> SimulationState[list[np.ndarray], list[RolloutStatus]]: ...
+
     def start(
         self,
         garment: Garment | Sequence[Garment],
@@ -174,7 +217,7 @@ class Simulator:
         *,
         first_vertices: Any = None,
         face_splits: int = 1,
-    ) -> SimulationState:
+    ) -> SimulationState[Any, Any]:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
         Args:
@@ -208,7 +251,9 @@ class Simulator:
         first = self._positions([b.vertices[0] for b in checked])
         return self._begin(garments, single, packed, known, [first], face_splits)[0]
 
-    def step(self, state: SimulationState, next_body_vertices: Any) -> SimulationState:
+    def step(
+        self, state: SimulationState[Vertices, Status], next_body_vertices: Any
+    ) -> SimulationState[Vertices, Status]:
         """One frame on.
 
         Args:
@@ -240,7 +285,7 @@ class Simulator:
         known: torch.Tensor,
         body_frames: list[torch.Tensor],
         face_splits: int,
-    ) -> list[SimulationState]:
+    ) -> list[SimulationState[Any, Any]]:
         """States of the known frames [K,V,3]: one for a cold start, H with a history."""
         scene = Scene(
             garments,
@@ -261,7 +306,7 @@ class Simulator:
             scene.graph = GraphedFrames(scene, functools.partial(advance, scene))
         finite = torch.ones(len(garments), dtype=torch.bool, device=self.device)
         unsolved = torch.zeros((2, 3), dtype=torch.float64, device=self.device)
-        states = []
+        states: list[SimulationState[Any, Any]] = []
         for frame, (vertices, body) in enumerate(zip(known, body_frames, strict=True)):
             if frame:
                 features = scene.features(known[frame - 1], body_frames[frame - 1], body)
@@ -273,7 +318,9 @@ class Simulator:
         return states
 
     @torch.inference_mode()
-    def _advance(self, state: SimulationState, next_body: torch.Tensor) -> SimulationState:
+    def _advance(
+        self, state: SimulationState[Vertices, Status], next_body: torch.Tensor
+    ) -> SimulationState[Vertices, Status]:
         scene = state.scene
         if scene.graph is None or self.timings.synchronise:
             after = advance(scene, state.now, next_body)

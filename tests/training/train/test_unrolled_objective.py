@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import typing
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import torch
 from support import sequences as synthetic_sequences
 from support.runs import config_for, entries_of, losses_of
 
+from warpgarment.kernels.features import LAYOUT
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
@@ -21,12 +24,13 @@ from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
 from warpgarment.training.samples import interactions
 from warpgarment.training.samples.augmentation import Augmentation
+from warpgarment.training.samples.drawing import Builder
 from warpgarment.training.samples.noise import NoiseConfig
 from warpgarment.training.samples.pushforward import PushforwardConfig
 from warpgarment.training.samples.recorded import SequenceData
-from warpgarment.training.samples.single_step import SampleBuilder
+from warpgarment.training.samples.single_step import Batch, SampleBuilder
 from warpgarment.training.samples.statistics import statistics
-from warpgarment.training.samples.unrolled import UnrolledBuilder
+from warpgarment.training.samples.unrolled import UnrolledBatch, UnrolledBuilder
 from warpgarment.training.train import start as train
 from warpgarment.training.train import unrolled_objective as unroll
 from warpgarment.training.train.losses import LossConfig
@@ -279,6 +283,38 @@ def test_an_unrolled_loss_that_is_not_finite_stops_the_run(data, tmp_path, monke
     assert len(saved["sequence"]) == 2
     assert np.isnan(saved["recorded"][0, 0]).all()
     assert np.isfinite(saved["features"]).all()
+
+
+def test_both_builders_are_what_a_loader_needs(loaded, network):
+    """One builder is taken for the other, whose batches are of another type, or a loader calls what only one has."""
+    single, unrolled = SampleBuilder(loaded, SMALL, QUIET, PLAIN), UnrolledBuilder(loaded, network, QUIET, PLAIN, 3, 0)
+    assert not isinstance(unrolled, SampleBuilder)
+    for name in ("build", "reaches"):
+        wanted = inspect.signature(getattr(Builder, name))
+        for builder in (SampleBuilder, UnrolledBuilder):
+            assert inspect.signature(getattr(builder, name)).parameters == wanted.parameters
+    assert typing.get_type_hints(SampleBuilder.build)["return"] is Batch
+    assert typing.get_type_hints(UnrolledBuilder.build)["return"] is UnrolledBatch
+    for name in typing.get_type_hints(Builder):
+        assert getattr(single, name) == getattr(unrolled, name), name
+
+
+@pytest.mark.parametrize("t", [0, 2, T])
+def test_both_begin_with_the_same_history(loaded, network, t):
+    """Unrolled training starts from another history than training of one step: in frames before the first, in what a
+    rollout did wrong, or with a body that is not at rest there. What no turn changes, to 1e-5: float32."""
+    shift = np.random.default_rng(2).normal(0.0, 0.01, (2, *loaded[0].vertices[0].shape)).astype(np.float32)
+    arguments = [(0, t)], len(loaded[0].faces), np.random.default_rng(4), [shift]
+    one = SampleBuilder(loaded, SMALL, QUIET, PLAIN).build(*arguments)
+    several = UnrolledBuilder(loaded, network, QUIET, PLAIN, 1, 0).build(*arguments)
+    speeds = [v.reshape(-1, SMALL.history - 1, 3).norm(dim=2) for v in (one.velocities, several.history.velocities)]
+    torch.testing.assert_close(*speeds, rtol=0, atol=1e-5)
+    assert (speeds[0][:, -1] > 1e-3).all() == (t > 0)  # the shift; in frame 0 that of all frames before it
+    features = one.features[0], several.history.stacked(several.features).flatten(1)
+    features = [part.unflatten(1, (SMALL.history, -1)) for part in features]
+    for name in ("singular_values", "body_velocity", "body_deformation"):
+        lengths = [part[..., LAYOUT[name]].norm(dim=2) for part in features]
+        torch.testing.assert_close(*lengths, rtol=0, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_samples_end_where_the_recording_does(loaded, network):
