@@ -93,6 +93,11 @@ def steps_taken(substeps: int) -> int:
     return taken
 
 
+LAYERED = BlenderSettings(substeps=20, compression=0.3, distance=6e-3)
+"""What data are made with. With the settings above, cloth that a moving limb pulls tight was drawn through the body and
+through other layers (up to 69 mm and 21 pairs of triangles in 75 frames of a martial art), and its edges gave way."""
+
+
 def steady_substeps(hardness: float, least: int) -> int:
     """Substeps for hinges so hard, bending over mass, not to tremble, from `least` to :data:`MOST_SUBSTEPS`.
 
