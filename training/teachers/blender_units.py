@@ -94,8 +94,9 @@ def steps_taken(substeps: int) -> int:
 
 
 LAYERED = BlenderSettings(substeps=20, compression=0.3, distance=6e-3)
-"""What data are made with. With the settings above, cloth that a moving limb pulls tight was drawn through the body and
-through other layers (up to 69 mm and 21 pairs of triangles in 75 frames of a martial art), and its edges gave way."""
+"""What data are made with. With the settings above, four of four outfits failed the gate within 52 frames: cloth that a
+limb pulled tight was drawn through the body by up to 37 mm, and compressed edges counted as stretched. With these all
+four stay within it for the 75 frames tried, at twice the time. A hanging strip is as long as its material says."""
 
 
 def steady_substeps(hardness: float, least: int) -> int:
