@@ -110,7 +110,11 @@ class QualityGate:
         )[0]
 
     def figures(self, frames: int) -> dict[str, float]:
-        """Figures over the first `frames` frames: means of means, maxima of maxima."""
+        """Figures over the first `frames` frames: means of means, maxima of maxima.
+
+        Of outfits, besides the most pairs of triangles that cross in a measured frame (`layer_crossings`), their mean
+        over these frames (`layer_crossings_mean`) and the share of these frames in which any do (`layer_crossed`).
+        """
         kept = self._frames[:frames]
         names = sorted({name for f in kept for name in f})
         summary = {}
@@ -118,4 +122,7 @@ class QualityGate:
             values = [f[name] for f in kept if name in f]
             combine = np.mean if name in ("stretch_mean", "inside") else np.max
             summary[name] = float(combine(values))
+            if name == "layer_crossings":
+                summary |= {"layer_crossings_mean": float(np.mean(values))}
+                summary |= {"layer_crossed": float(np.mean(np.greater(values, 0)))}
         return summary

@@ -122,6 +122,7 @@ def make_teacher(name: Literal["newton", "blender"], device: str | None = "cpu")
         return NewtonTeacher(NewtonSettings(layer_friction=LAYER_FRICTION), device=device)
     if name == "blender":
         from warpgarment.training.teachers.blender.teacher import BlenderTeacher
+        from warpgarment.training.teachers.blender.units import LAYERED
 
-        return BlenderTeacher()
+        return BlenderTeacher(LAYERED)
     raise ValueError(f"unknown teacher {name!r}; there are {', '.join(TEACHERS)}")

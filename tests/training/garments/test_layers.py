@@ -10,6 +10,7 @@ import trimesh
 from warpgarment.metrics import layer_collision
 from warpgarment.objects.garment import Garment
 from warpgarment.training.garments.layers import LayerFigures, Sheet
+from warpgarment.training.generate.quality import Limits, QualityGate
 
 
 def _sheet(height: float, cells: int = 10, size: float = 0.4) -> Garment:
@@ -118,3 +119,23 @@ def test_figures_of_three_layers_and_of_one():
         LayerFigures(sheets).measure([s.vertices for s in sheets[:2]])
     broken = sheets[0].vertices * np.nan
     assert np.isnan(LayerFigures(sheets[:2]).measure([broken, sheets[1].vertices])["layer_inside"])
+
+
+def test_crossings_of_a_sequence_are_told():
+    """If this fails, a set's manifests hide how often the garments of its outfits go through each other."""
+    inner, outer = _sheet(0.0), _sheet(0.005)
+    pushed = outer.vertices.copy()
+    pushed[(pushed[:, 0] < 0.13) & (pushed[:, 2] < 0.13), 1] = -0.008
+    pushed += [0.0037, 0.0, 0.0023]  # where edges lie on edges, whether they cross is a matter of rounding
+    pairs = int(_overlaps(inner.vertices, inner.faces, pushed, outer.faces).sum())
+    ball = trimesh.creation.icosphere(radius=0.1)
+    far = np.asarray(ball.vertices) - 5.0
+    gate = QualityGate((inner, outer), np.asarray(ball.faces), Limits(layer_inside=1.0), every=1)
+    for frame, moved in enumerate((outer.vertices, pushed, outer.vertices, outer.vertices)):
+        assert gate.check(frame, np.concatenate([inner.vertices, moved]), far) is None
+    figures = gate.figures(4)
+    assert pairs > 10
+    assert figures["layer_crossings"] == pairs
+    assert figures["layer_crossings_mean"] == pairs / 4
+    assert figures["layer_crossed"] == 0.25
+    assert "layer_crossed" not in QualityGate((inner,), np.asarray(ball.faces)).figures(0)

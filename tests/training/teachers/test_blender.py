@@ -18,11 +18,12 @@ from scipy.spatial.transform import Rotation
 from warpgarment.io.pc2 import read_pc2
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
-from warpgarment.training.materials import to_blender
+from warpgarment.training.materials import RANGES, to_blender
 from warpgarment.training.teachers import Cloth, ClothScene, TeacherError, make_teacher
 from warpgarment.training.teachers.blender import environment
 from warpgarment.training.teachers.blender.teacher import BlenderTeacher, write_scene
 from warpgarment.training.teachers.blender.units import (
+    LAYERED,
     BlenderSettings,
     blender_numbers,
     pin_path,
@@ -30,6 +31,7 @@ from warpgarment.training.teachers.blender.units import (
     to_y_up,
     to_z_up,
 )
+from warpgarment.training.teachers.checks import hanging_strip
 
 STAND_IN = """
     import json, os, sys, time
@@ -250,6 +252,19 @@ def test_stiff_hinges_get_more_substeps_and_are_limited_beyond():
     assert max(hardness) == pytest.approx(4.0)
 
 
+def test_data_are_made_with_the_settings_that_were_chosen(monkeypatch):
+    """If this fails, `generate --teacher blender` draws cloth through the body, as the plain settings did."""
+    monkeypatch.setenv(environment.VARIABLE, sys.executable)
+    teacher = make_teacher("blender")
+    assert isinstance(teacher, BlenderTeacher)
+    assert teacher._settings == LAYERED
+    told = blender_numbers(ClothScene((Cloth(_sheet(), 0.04),), frames=1), LAYERED)[0]
+    assert told["cloth"]["quality"] == 20
+    assert told["cloth"]["compression_stiffness"] == pytest.approx(0.3 * told["cloth"]["tension_stiffness"])
+    kept = told["collision"]["distance_min"] + told["collider"]["thickness_outer"]
+    assert kept / LAYERED.scale == pytest.approx(6e-3), "the distance from the body that is kept [m]"
+
+
 def test_a_missing_environment_names_the_command(monkeypatch, tmp_path):
     """If this fails, a user without Blender does not learn how to get it."""
     monkeypatch.delenv(environment.VARIABLE, raising=False)
@@ -328,3 +343,23 @@ def test_blender_drapes_a_sheet_over_a_moving_ball():
     moved = shown[-1].mean(0)[0] - shown[0].mean(0)[0]
     assert 0.02 < moved < 4.0 / 30.0, "friction does not take it along"
     np.testing.assert_array_equal(shown, np.stack(list(BlenderTeacher().simulate(scene))))
+
+
+@pytest.mark.skipif(
+    environment.VARIABLE not in os.environ, reason="needs Blender, of which a variable names the Python"
+)
+def test_blender_stretches_as_the_material_asks():
+    """If this fails, a network is taught materials that do not count: both ends of what is drawn must hang apart.
+
+    A strip of 0.6 m stretches by density g L^2 / 2 E: 2.8 mm when soft and heavy, 0.1 mm when stiff and light.
+    Tolerance: borders of the strip are stiffer than its inside, and it is hung by a clamped edge.
+    """
+    soft, stiff = (
+        Material(density=density, stretch=RANGES["stretch"][end], shear=RANGES["shear"][end])
+        for density, end in ((RANGES["density"][1], 0), (RANGES["density"][0], 1))
+    )
+    teacher = BlenderTeacher(LAYERED)
+    hung = [hanging_strip(teacher, m, length=0.6, width=0.12, edge=0.03, settle=120) for m in (soft, stiff)]
+    for result in hung:
+        assert result.measured == pytest.approx(result.expected, rel=0.15), str(result)
+    assert hung[0].measured > 20 * hung[1].measured

@@ -92,6 +92,12 @@ def steps_taken(substeps: int) -> int:
     return taken
 
 
+LAYERED = BlenderSettings(substeps=20, compression=0.3, distance=6e-3)
+"""What data are made with. With the settings above, four of four outfits failed the gate within 52 frames: cloth that a
+limb pulled tight was drawn through the body by up to 37 mm, and compressed edges counted as stretched. With these all
+four stay within it for the 75 frames tried, at twice the time. A hanging strip is as long as its material says."""
+
+
 def steady_substeps(hardness: float, least: int) -> int:
     """Substeps for hinges so hard, bending over mass, not to tremble, from `least` to :data:`MOST_SUBSTEPS`.
 
