@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # IPC Toolkit: the "minimum distance" is a squared one
 #
-# Expected: NormalCollisions.compute_minimum_distance of two triangles 1 cm apart is 0.01: its name and docstring speak of
-#           a distance, and dhat, which build() of the same class takes, is one.
+# Expected: NormalCollisions.compute_minimum_distance of two triangles 1 cm apart is 0.01: its name and docstring speak
+#           of a distance, and dhat, which build() of the same class takes, is one.
 # Seen:     0.0001. point_triangle_distance is squared as well; dhat and the step of compute_collision_free_stepsize are
 #           in plain lengths.
 # Versions: ipctk 1.6.1, numpy 2.4.6.
@@ -38,7 +38,12 @@ print("ipctk", ipctk.__version__)
 print(f"two triangles {gap} apart; pairs within dhat: {list(found.values())} at 0.9 and 1.1 of that")
 print(f"expected: minimum distance {gap}")
 print(f"seen:     minimum distance {least:.6f}, point_triangle_distance {element:.6f}; free step {2 * step:.4f} of 2 m")
-still = list(found.values()) == [0, 1] and np.isclose(least, gap**2) and np.isclose(element, gap**2) and 0.009 < 2 * step <= gap
+still = (
+    list(found.values()) == [0, 1]
+    and np.isclose(least, gap**2)
+    and np.isclose(element, gap**2)
+    and 0.009 < 2 * step <= gap
+)
 sys.exit(0 if still else "no longer so: distances are plain lengths now")
 PY
 cd "$work"

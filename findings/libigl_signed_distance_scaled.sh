@@ -2,10 +2,10 @@
 # libigl: winding numbers change the size of a signed distance, not only its sign
 #
 # Expected: signed_distance is plus or minus the distance to the surface, whatever decides the sign.
-# Seen:     with winding numbers, libigl's default, the distance is multiplied by 1 - 2w: where two parts of a body overlap
-#           (w = 2) it is three times too deep. With the fast approximation w is not an integer, and distances outside,
-#           too, are off (0.1 % two radii away). point-cloud-utils, which builds on libigl, does the same; gpytoolbox,
-#           which builds on it too, and libigl's pseudo-normals do not.
+# Seen:     with winding numbers, libigl's default, the distance is multiplied by 1 - 2w: where two parts of a body
+#           overlap (w = 2) it is three times too deep. With the fast approximation w is not an integer, and distances
+#           outside, too, are off (0.1 % two radii away). point-cloud-utils, which builds on libigl, does the same;
+#           gpytoolbox, which builds on it too, and libigl's pseudo-normals do not.
 # Versions: libigl 2.6.3, point-cloud-utils 0.34.0, gpytoolbox 0.3.8, numpy 2.4.6.
 # So:       posed limbs overlap, and a depth of 5 mm in an armpit is reported as 15. Take the sign from one call and the
 #           length from point_mesh_squared_distance. As a reference in tests, compare away from overlaps or do the same.
@@ -13,7 +13,8 @@ set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 "${PYTHON:-python3}" -m venv "$work/venv"
-"$work/venv/bin/python" -m pip install -qq --disable-pip-version-check libigl==2.6.3 point-cloud-utils==0.34.0 gpytoolbox==0.3.8 scipy==1.17.1 numpy==2.4.6
+"$work/venv/bin/python" -m pip install -qq --disable-pip-version-check \
+  libigl==2.6.3 point-cloud-utils==0.34.0 gpytoolbox==0.3.8 scipy==1.17.1 numpy==2.4.6
 cat >"$work/show.py" <<'PY'
 import sys
 
@@ -42,7 +43,9 @@ def sphere(centre, rings=24):
 vertices, faces = np.vstack([v, w]), np.vstack([f, g + len(v)]).astype(np.int64)
 points = np.array([[0.5, 0.1, 0.0], [-0.5, 0.1, 0.0], [3.0, 0.1, 0.0]])  # in both spheres, in one, outside
 plain = np.sqrt(igl.point_mesh_squared_distance(points, vertices, faces)[0])
-kind = lambda name: igl.signed_distance(points, vertices, faces, sign_type=getattr(igl, "SIGNED_DISTANCE_TYPE_" + name))[0]
+kind = lambda name: igl.signed_distance(
+    points, vertices, faces, sign_type=getattr(igl, "SIGNED_DISTANCE_TYPE_" + name)
+)[0]
 answers = {
     "libigl, winding numbers": kind("WINDING_NUMBER"),
     "libigl, by default": igl.signed_distance(points, vertices, faces)[0],

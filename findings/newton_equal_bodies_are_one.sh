@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Newton: two identical bodies are one mesh, and to move one is to move both
 #
-# Expected: two add_shape_mesh calls with two newton.Mesh objects give two meshes; writing the points of the first body's
-#           and refitting it poses the first body.
+# Expected: two add_shape_mesh calls with two newton.Mesh objects give two meshes; writing the points of the first
+#           body's and refitting it poses the first body.
 # Seen:     meshes with equal vertices and faces are merged when the model is finalized: both shapes point to the same
 #           wp.Mesh, and the second source has none (its .mesh is None). A change of one millimetre in one vertex is
 #           enough to keep them apart.

@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
 # Newton: with self-contact on, cloth that touches nothing falls at a terminal velocity in a vacuum
 #
-# Expected: SolverVBD with particle_enable_self_contact lets a flat sheet, alone in the world, fall freely: 9.8 m/s after
-#           a second. Contact handling costs time, not motion, while nothing is near.
+# Expected: SolverVBD with particle_enable_self_contact lets a flat sheet, alone in the world, fall freely: 9.8 m/s
+#           after a second. Contact handling costs time, not motion, while nothing is near.
 # Seen:     the sheet stops accelerating at 1.8 m/s with 10 substeps a frame and at 0.36 m/s with 2. A vertex may move
 #           only by a share of the detection range a step, however far the next triangle is, so speed is bounded by
 #           range / step. Fewer substeps give slower cloth, not coarser cloth.
 # Versions: newton 1.8.0, warp-lang 1.19.0, numpy 2.4.6.
-# So:       a garment on a runner trails behind the body, and data recorded so teaches a drag that is not air.
-#           Simulate in a frame that moves with the body, enlarge the gap, or take more substeps.
+# So:       a garment on a runner trails behind the body, and data recorded so teaches a drag that is not air. Simulate
+#           in a frame that moves with the body, enlarge the gap, or take more substeps.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
@@ -46,7 +46,12 @@ def speed_of_fall(self_contact, substeps, seconds=1.0):
     return float(-here.particle_qd.numpy()[:, 2].mean())
 
 
-off, on, half, coarse = speed_of_fall(False, 10), speed_of_fall(True, 10), speed_of_fall(True, 10, 0.5), speed_of_fall(True, 2)
+off, on, half, coarse = (
+    speed_of_fall(False, 10),
+    speed_of_fall(True, 10),
+    speed_of_fall(True, 10, 0.5),
+    speed_of_fall(True, 2),
+)
 print("newton", newton.__version__)
 print(f"expected: 9.81 m/s after a second (without self-contact: {off:.2f})")
 print(f"seen:     {on:.2f} m/s with 10 substeps ({half:.2f} after half a second), {coarse:.2f} m/s with 2 substeps")

@@ -3,10 +3,10 @@
 #
 # Expected: a strip that hangs by its upper edge gets longer by its weight over its stiffness: ten or a hundred times
 #           stiffer, ten or a hundred times less.
-# Seen:     at 10 substeps and 5 iterations it is 0.28 % longer at tri_ke 1e3,
-#           1e4 and 1e5 alike (within a tenth of that). With 10 iterations it is 0.15 %, at all three. What is measured is
-#           how far the iteration got, and so it is in the wrong place: more iterations on a softer cloth is stiffer.
-#           Though it hangs straight, it also begins to swing by itself, several centimetres in a second.
+# Seen:     at 10 substeps and 5 iterations it is 0.28 % longer at tri_ke 1e3, 1e4 and 1e5 alike (within a tenth of
+#           that). With 10 iterations it is 0.15 %, at all three. What is measured is how far the iteration got, and so
+#           it is in the wrong place: more iterations on a softer cloth is stiffer. Though it hangs straight, it also
+#           begins to swing by itself, several centimetres in a second.
 # Versions: newton 1.8.0, warp-lang 1.19.0, numpy 2.4.6.
 # So:       a data set with "material" as an input, recorded so, has nothing to learn. Check the elongation of a strip
 #           at both ends of the range of stiffness before recording.
@@ -57,7 +57,9 @@ few = {k: hang(k, 5) for k in (1e3, 1e4, 1e5)}
 more = {k: hang(k, 10) for k in (1e3, 1e4, 1e5)}
 print("expected: elongation in proportion to 1 / tri_ke, at any number of iterations that is enough")
 for name, table in (("5 iterations ", few), ("10 iterations", more)):
-    print(f"seen:     {name}", ", ".join(f"{e:.3f} % at {k:.0e} (swings {1e2 * s:.0f} cm)" for k, (e, s) in table.items()))
+    print(
+        f"seen:     {name}", ", ".join(f"{e:.3f} % at {k:.0e} (swings {1e2 * s:.0f} cm)" for k, (e, s) in table.items())
+    )
 alike = all(max(e for e, _ in t.values()) < 1.25 * min(e for e, _ in t.values()) for t in (few, more))
 still = alike and all(few[k][0] > 1.5 * more[k][0] for k in few)
 sys.exit(0 if still else "no longer so: stiffness changes the elongation, or iterations do not")

@@ -3,11 +3,11 @@
 #
 # Expected: save_file keeps values; or it refuses, as safetensors.torch does for tensors that are not contiguous.
 # Seen:     safetensors.numpy copies the memory as it lies and writes the logical shape beside it. The left factor of
-#           scipy.linalg.svd, which LAPACK leaves in Fortran order, comes back with its entries permuted: finite,
-#           the right norm, the wrong matrix. safetensors 0.7.0 wrote it correctly.
+#           scipy.linalg.svd, which LAPACK leaves in Fortran order, comes back with its entries permuted: finite, the
+#           right norm, the wrong matrix. safetensors 0.7.0 wrote it correctly.
 # Versions: safetensors 0.8.0 (and 0.7.0 for comparison), scipy 1.17.1, numpy 2.4.6.
-# So:       body shape bases, skinning weights and anything transposed go through np.ascontiguousarray before saving, and
-#           a load after saving is compared. Files that 0.8.0 wrote from such arrays are wrong for good.
+# So:       body shape bases, skinning weights and anything transposed go through np.ascontiguousarray before saving,
+#           and a load after saving is compared. Files that 0.8.0 wrote from such arrays are wrong for good.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
@@ -43,7 +43,9 @@ print(f"left factor of scipy.linalg.svd, in C order: {new['c_order']}")
 print(f"expected: the same values after save and load (safetensors {old['version']}: {old['same']})")
 print(f"seen:     safetensors {new['version']}: same {new['same']}, shape {new['shape']}, norm x {new['norm']:.3f}, ")
 print(f"          columns off orthogonal by {new['orthogonal']:.2f}; of a contiguous copy: same {new['copy']}")
-still = not new["c_order"] and new["shape"] and not new["same"] and new["copy"] and old["same"] and new["orthogonal"] > 0.1
+still = (
+    not new["c_order"] and new["shape"] and not new["same"] and new["copy"] and old["same"] and new["orthogonal"] > 0.1
+)
 sys.exit(0 if still else "no longer so: arrays in Fortran order are kept or refused")
 PY
 cd "$work"

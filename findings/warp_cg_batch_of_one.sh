@@ -4,8 +4,8 @@
 # Expected: warp.optim.linear.cg takes about the time of its one matrix product and two dot products an iteration, and
 #           saying that the unknowns form one block changes nothing.
 # Seen:     with 5,000 unknowns, unbatched, an iteration costs 15 to 20 ms (SciPy: 0.05 ms). With the same operator and
-#           batch_offsets=[0, n] it is over ten times faster and ends at the same solution: the two paths reduce
-#           dot products with different kernels, and the unbatched one is made for a GPU.
+#           batch_offsets=[0, n] it is over ten times faster and ends at the same solution: the two paths reduce dot
+#           products with different kernels, and the unbatched one is made for a GPU.
 # Versions: warp-lang 1.19.0, scipy 1.17.1, numpy 2.4.6, on the CPU. The ratio is asserted (5 or more), not the times.
 # So:       wrap the matrix in a LinearOperator with batch_offsets where the CPU matters, or write the loop as one block
 #           of threads (kernels/cg.py). A profile of the matrix product alone does not show it.
@@ -53,8 +53,10 @@ start = time.perf_counter()
 scipy.sparse.linalg.cg(a.tocsr(), b, rtol=0, maxiter=rounds)
 print("warp", wp.config.version)
 print(f"SciPy: {1e3 * (time.perf_counter() - start) / rounds:.2f} ms an iteration")
-print(f"expected: as is and as a batch of one alike")
-print(f"seen:     {slow:.2f} ms as is, {fast:.2f} ms as a batch of one; the solutions differ by {np.abs(x - y).max():.0e}")
+print("expected: as is and as a batch of one alike")
+print(
+    f"seen:     {slow:.2f} ms as is, {fast:.2f} ms as a batch of one; the solutions differ by {np.abs(x - y).max():.0e}"
+)
 still = slow > 5 * fast and np.abs(x - y).max() < 1e-3
 sys.exit(0 if still else "no longer so: unbatched conjugate gradients keep up on the CPU, or the solutions differ")
 PY

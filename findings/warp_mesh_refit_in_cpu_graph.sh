@@ -3,8 +3,8 @@
 #
 # Expected: a step that moves a mesh's points, refits it and casts a ray does the same whether it is run or captured and
 #           replayed. Warp's Bvh.refit() says in its docstring that a CPU capture records it; Mesh.refit() sounds alike.
-# Seen:     the replayed copy moves the points, the ray is cast, but the hierarchy stays where it was during the capture:
-#           the ray misses a sphere that is in front of it. No warning. A refit after the replay makes it hit.
+# Seen:     the replayed copy moves the points, the ray is cast, but the hierarchy stays where it was during the
+#           capture: the ray misses a sphere that is in front of it. No warning. A refit after the replay makes it hit.
 # Versions: warp-lang 1.19.0, numpy 2.4.6, on the CPU.
 # So:       a moving body inside a captured simulation step answers for its first pose. Refit outside the capture, that
 #           is between two graphs. Nearest-point queries hide it: they often find the right face with stale bounds.
@@ -92,10 +92,15 @@ replayed_hit, refitted_hit, points = with_mesh(True)
 boxes_hit = with_boxes(True)
 print("warp", wp.config.version)
 print(f"expected: the ray hits the moved mesh at {run_hit:.2f}, run or replayed")
-print(f"seen:     replayed {replayed_hit:.2f} (-1: missed), points at x = {points[:, 0].mean():.1f}, after refit() {refitted_hit:.2f}")
+print(
+    f"seen:     replayed {replayed_hit:.2f} (-1: missed), points at x = {points[:, 0].mean():.1f},",
+    f"after refit() {refitted_hit:.2f}",
+)
 print(f"          the same with wp.Bvh: box {boxes_hit:.0f} hit (-1: missed)")
 still = run_hit > 0 and replayed_hit == -1 and refitted_hit == run_hit and boxes_hit == 0 and points[:, 0].mean() > 4.9
-sys.exit(0 if still else "no longer so: Mesh.refit() in a CPU graph behaves like Bvh.refit() now, or neither is recorded")
+sys.exit(
+    0 if still else "no longer so: Mesh.refit() in a CPU graph behaves like Bvh.refit() now, or neither is recorded"
+)
 PY
 cd "$work"
 WARP_CACHE_PATH="$work/kernels" "$work/venv/bin/python" show.py

@@ -4,13 +4,13 @@
 # Expected: wp.mesh_query_point_sign_winding_number tells inside from outside by generalised winding numbers, for any
 #           wp.Mesh; or it says why it cannot.
 # Seen:     on a mesh built without support_winding_number=True it casts three rays instead, without a word. On two
-#           overlapping spheres (an arm against the torso) one inside point in forty is called outside.
-#           On a mesh with triangle groups, though the flag was given, every inside point of these spheres is called
-#           outside (on another tessellation half of all points came out wrong, both ways): a single group is enough,
-#           and spheres that do not touch. Distances stay right, so nothing shows.
+#           overlapping spheres (an arm against the torso) one inside point in forty is called outside. On a mesh with
+#           triangle groups, though the flag was given, every inside point of these spheres is called outside (on
+#           another tessellation half of all points came out wrong, both ways): a single group is enough, and spheres
+#           that do not touch. Distances stay right, so nothing shows.
 # Versions: warp-lang 1.19.0, numpy 2.4.6, on the CPU.
-# So:       give the flag, and one wp.Mesh per body with an array of ids rather than one mesh with groups.
-#           See kernels/closest.py and kernels/body_meshes.py.
+# So:       give the flag, and one wp.Mesh per body with an array of ids rather than one mesh with groups. See
+#           kernels/closest.py and kernels/body_meshes.py.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
@@ -56,9 +56,14 @@ def wrong(apart, groups=None, flag=True):
     labels = {None: None, "one": np.zeros(len(faces)), "two": np.repeat([0, 1], [len(f), len(g)])}[groups]
     labels = None if labels is None else wp.array(labels.astype(np.int32), dtype=int)
     mesh = wp.Mesh(
-        wp.array(vertices, dtype=wp.vec3), wp.array(faces.ravel(), dtype=int), support_winding_number=flag, groups=labels
+        wp.array(vertices, dtype=wp.vec3),
+        wp.array(faces.ravel(), dtype=int),
+        support_winding_number=flag,
+        groups=labels,
     )
-    points = np.random.default_rng(0).uniform([-1.5, -1.5, -1.5], [apart + 1.5, 1.5, 1.5], (20000, 3)).astype(np.float32)
+    points = (
+        np.random.default_rng(0).uniform([-1.5, -1.5, -1.5], [apart + 1.5, 1.5, 1.5], (20000, 3)).astype(np.float32)
+    )
     a, b = np.linalg.norm(points, axis=1), np.linalg.norm(points - [apart, 0, 0], axis=1)
     use = (np.abs(a - 1) > 0.05) & (np.abs(b - 1) > 0.05)  # away from the surface: no question of rounding
     points, inside = points[use], (np.minimum(a, b) < 1)[use]
@@ -71,7 +76,9 @@ near, apart = wrong(1.0), wrong(3.0)
 no_flag, two, one = wrong(1.0, flag=False), wrong(3.0, "two"), wrong(3.0, "one")
 print("warp", wp.config.version)
 print("inside points called outside, outside points called inside")
-print(f"expected: {near[0]:.1%} and {near[1]:.1%} overlapping, {apart[0]:.1%} and {apart[1]:.1%} apart (flag, no groups)")
+print(
+    f"expected: {near[0]:.1%} and {near[1]:.1%} overlapping, {apart[0]:.1%} and {apart[1]:.1%} apart (flag, no groups)"
+)
 print(f"seen:     {no_flag[0]:.1%} and {no_flag[1]:.1%} overlapping, without the flag")
 print(f"          {two[0]:.1%} and {two[1]:.1%} apart, with two groups; {one[0]:.1%} and {one[1]:.1%} with one group")
 still = max(near + apart) == 0 and max(no_flag) > 0.01 and max(two) > 0.05 and max(one) > 0.05
