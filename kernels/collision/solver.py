@@ -121,9 +121,9 @@ class CollisionSolver:
         """What the last refinement says: iterations, components stopped by the limit, their largest error; not read."""
         return self._progress.summary()
 
-    def tell(self, stopped: float, error: float) -> None:
+    def warn_if_stopped(self, stopped: float, error: float) -> None:
         """Warns, once, if a summary that was read from the device says that components were stopped."""
-        self._progress.tell(stopped, self.component_count, error)
+        self._progress.warn_if_stopped(stopped, self.component_count, error)
 
     @property
     def contacts(self) -> int:
