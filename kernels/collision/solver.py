@@ -50,7 +50,7 @@ TOLERANCE = 2e-6
 """Error of a solve in the energy norm [m].
 
 Measured on skirts of 1,000 to 10,000 faces, 15 mm deep in a body, solved for displacements: the worst vertex is off by
-0.02 to 0.03 mm at 1e-5 or 5e-6 and 0.009 mm at 2e-6. For contact forces see `collision_operator.RESIDUAL`.
+0.02 to 0.03 mm at 1e-5 or 5e-6 and 0.009 mm at 2e-6. For contact forces see `operator.RESIDUAL`.
 """
 
 

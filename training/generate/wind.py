@@ -6,7 +6,7 @@
 **From Blender's strengths to metres per second.** Blender's wind exerts a force on a face that does not depend on the
 face's velocity: 0.02/30 of its own force units per square metre and unit of strength (measured on a free sheet in
 Blender 4.5; equal at 1,000 and 2,000, at twice the mass and on a coarser mesh, within 3 %). With the units of
-:mod:`.materials` (one of its masses is a gram at life size) that is a pressure of S scale² 0.02/30 [Pa], and
+:mod:`training.materials` (one of its masses is a gram at life size) that is a pressure of S scale² 0.02/30 [Pa], and
 :func:`speed_of_strength` gives the wind whose drag head-on, ½ ρ C_D v², equals it. D-LAYERS does not publish its
 strengths. Strengths at which cloth moves well, 1,000 to 20,000 at life size, are 1.0 to 4.3 m/s; in a scene ten times
 as large these numbers are 9.5 to 43 m/s, since the faces are a hundred times as large and the masses are not.

@@ -14,7 +14,7 @@ What comes out is the solver as much as the cloth. Newton's VBD, stopped after s
 | 10 x 20, 20 x 5       | 5 %, 9 % too far        | 1.1 % too long          |
 | 20 x 10, `CONVERGED`  | as it should, 0.1 %     | 0.8 % too long          |
 
-and for stiffer, lighter or finer cloth by more: see :mod:`.newton_vbd`. What is left of the period is the mesh: half
+and for stiffer, lighter or finer cloth by more: see :mod:`.newton`. What is left of the period is the mesh: half
 the edge length leaves 0.2 %.
 """
 
