@@ -62,22 +62,22 @@ def shown(rows: Iterable[Row]) -> Iterator[Row]:
         where = " ".join(f"{row[key]:>6,} {key}" for key in ("faces", "batch") if key in row)
         where += f" {row['network']}" if "network" in row else ""
         if "note" in row:
-            said = f"{row.get('reference', '')} {row['note']}".strip()
+            text = f"{row.get('reference', '')} {row['note']}".strip()
         elif "median_ms" in row:
-            said = f"{row.get('min_ms', row['median_ms']):10.2f} ms"
-            said += f"   {row['ratio']:8.2f} x {row['reference']}" if "ratio" in row else ""
-            said += f"   {row['achieved']:.0%} of the roofline" if "achieved" in row else ""
+            text = f"{row.get('min_ms', row['median_ms']):10.2f} ms"
+            text += f"   {row['ratio']:8.2f} x {row['reference']}" if "ratio" in row else ""
+            text += f"   {row['achieved']:.0%} of the roofline" if "achieved" in row else ""
         elif "reached" in row and "warp_launches" not in row:
-            said = ""
+            text = ""
         else:
-            said = ", ".join(
+            text = ", ".join(
                 f"{k} {v:g}"
                 for k, v in row.items()
                 if isinstance(v, (int, float)) and k not in ("faces", "batch", "met")
             )
         if "target" in row:
-            said += f"   {'met' if row['met'] else 'MISSED'}: {row['target']} ({row['reached']})"
-        print(f"{time.perf_counter() - began:6.0f} s  {where:<22} {row['what']:<36} {said}", flush=True)
+            text += f"   {'met' if row['met'] else 'MISSED'}: {row['target']} ({row['reached']})"
+        print(f"{time.perf_counter() - began:6.0f} s  {where:<22} {row['what']:<36} {text}", flush=True)
         yield row
 
 

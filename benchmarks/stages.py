@@ -100,10 +100,10 @@ def _distances(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds
         yield aimed(row, "1.5 x faster than libigl, more exact", reached, better) if device.type == "cpu" else row
 
     base = {"part": "stages", "faces": len(triangles)}
-    asked, host = tensor(scene.pressed, device), scene.pressed.astype(np.float64)
+    pressed, host = tensor(scene.pressed, device), scene.pressed.astype(np.float64)
     calls: dict[str, Call] = {
-        "contact query, within 4 mm": lambda: bodies.query(asked, within=0.004),
-        "depth query, inside only": lambda: bodies.query(asked, within=0.0),
+        "contact query, within 4 mm": lambda: bodies.query(pressed, within=0.004),
+        "depth query, inside only": lambda: bodies.query(pressed, within=0.0),
     }
     yield from compared(
         base | {"what": "queries"}, calls, {"libigl fast winding number": lambda: libigl(host)}, device, seconds

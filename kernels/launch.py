@@ -1,4 +1,4 @@
-"""What every operator needs to pass torch tensors to Warp: checks, zero-copy views and the stream."""
+"""Passing torch tensors to Warp, as every operator does: checks, zero-copy views and the stream."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Singular values of deformation gradients: reading them, replacing them, removing them.
 
 Manifold-aware transformers, section 4.3.1 and Algorithm 1 ("replace singular values of Φ with Σ"). The network
-predicts the singular values of a face's deformation gradient apart from the gradient itself, because they say how
+predicts the singular values of a face's deformation gradient apart from the gradient itself, because they measure how
 much cloth stretches; here they are put back:
 
     Φ = U diag(σ) Vᵀ,    R(Φ, s) = U diag(|s|) Vᵀ,    U and V proper rotations, σ₁ >= σ₂ >= |σ₃|

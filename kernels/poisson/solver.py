@@ -62,8 +62,9 @@ class PoissonSolver:
         faces: Vertex indices, int32 [F,3].
         pins: Vertices held by soft constraints, integers [P], no vertex twice.
         pin_weight: Stiffness of a pin, in units of the mean diagonal entry of the Laplacian.
-        tolerance: Where conjugate gradients stop: error in the energy norm as a share of the component's rest bounding
-            box diagonal. The default keeps every vertex within 1e-5 of that diagonal of the direct solution.
+        tolerance: Error in the energy norm at which conjugate gradients stop, as a share of the diagonal of the
+            component's rest bounding box. The default keeps every vertex within 1e-5 of that diagonal of the direct
+            solution.
         max_iterations: Limit of conjugate gradients per solve; reaching it warns once.
         factor_budget: Limit of the entries of all factors together, 12 bytes each. Components whose factor does not
             fit are solved by conjugate gradients; with zero, all components are.

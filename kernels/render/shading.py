@@ -88,7 +88,7 @@ def _occlusion(
     p: wp.vec3,
     n: wp.vec3,
 ) -> float:
-    """How open p is, from the depth buffer alone (1: nothing near rises above its tangent plane)."""
+    """Openness of p, from the depth buffer alone; 1 if nothing near p rises above its tangent plane."""
     radius = stage.occlusion_radius
     reach = radius * view.scale * closeness
     blocked = wp.float32(0.0)

@@ -1,4 +1,4 @@
-"""Which face of a body is named the nearest one where several are equally near.
+"""The rule for the nearest face of a body if several faces are equally near.
 
 Manifold-aware transformers, section 4.2 (the nearest body face of d_i). For every fourth point around a person the
 nearest point of the body lies on an edge or a vertex: over a convex edge, the faces on both sides are equally near.

@@ -1,4 +1,4 @@
-r"""How deep garments are inside bodies: at vertices, and between them.
+r"""Depth of garments inside bodies: at vertices, and between them.
 
 A vertex of a garment keeps a distance from the body, but the body can still come through an edge or a face whose
 corners are all outside. The points examined are

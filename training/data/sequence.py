@@ -72,7 +72,7 @@ class Sequence:
 
     @classmethod
     def load(cls, folder: str | Path) -> Sequence:
-        """Reads a sequence. Positions are memory-mapped, and decoded when first asked for.
+        """Reads a sequence. Positions are memory-mapped, and decoded when they are first used.
 
         Raises:
             MeshError: The manifest or an array is missing, damaged, of another type or shape, or does not fit the
