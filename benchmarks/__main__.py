@@ -1,15 +1,15 @@
-"""Times everything against a reference in the same run, for the device at hand; writes JSON, a table and a plot.
+"""Times kernels, network and frames against references in one run on one device; writes JSON, tables and plots.
 
     python -m benchmarks                               # all parts, about ten minutes on one core
     python -m benchmarks --quick                       # fewer sizes, one or two minutes
     python -m benchmarks --only stages roofline
     python -m benchmarks --faces 1000 --batch 1 8      # other sizes and batches
 
-Parts: `geodesics` distances over the cloth; `stages` each kernel beside the published way; `batch` whole frames, packed
-and one by one; `roofline` the network beside the device's own rates; `teacher` whole frames beside Newton's VBD;
-`profile` launches and waits within a frame. A CPU is measured on one thread. Calls that are compared take turns. Frames
-are those of the networks `small` and `fast`, or of those that `--network` names. Results:
-benchmarks/results/<device>.json, .md and .png. Needs the extras `physics` and `train`.
+The parts are `geodesics`, distances over the cloth; `stages`, each kernel beside the published method; `batch`, whole
+frames, packed and one by one; `roofline`, the network beside the device's own rates; `teacher`, whole frames beside
+Newton's VBD; `profile`, launches and waits within a frame. A CPU is measured on one thread. Calls that are compared
+take turns. Frames are those of the networks `small` and `fast`, or of the networks given by `--network`. Results are in
+benchmarks/results/<device>.json, .md and .png. The extras `physics` and `train` are needed.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from . import batch, frames, manifold, report, roofline, stages, teacher
 PARTS = ("geodesics", "stages", "batch", "roofline", "teacher", "profile")
 FACES = (500, 1000, 2000, 5000, 10000)
 QUICK = (500, 2000)
-GEODESICS = (1000, 2000, 5000)  # and without --quick 10000, which everything of that size needs
-SECONDS = {False: 0.5, True: 0.15}  # spent on each call that is timed, by --quick
+GEODESICS = (1000, 2000, 5000)  # numbers of faces; without --quick also 10000, which later parts of that size need
+SECONDS = {False: 0.5, True: 0.15}  # --quick -> time spent on each call that is timed [s]
 
 
 def measured(options: argparse.Namespace, device: torch.device) -> Iterator[Row]:
-    """All rows of the parts that were asked for."""
+    """All rows of the parts that the options name."""
     seconds, networks = SECONDS[options.quick], named(options.network)
     if "geodesics" in options.only:
         yield from manifold.geodesics(options.geodesics)
@@ -56,33 +56,33 @@ def measured(options: argparse.Namespace, device: torch.device) -> Iterator[Row]
 
 
 def shown(rows: Iterable[Row]) -> Iterator[Row]:
-    """Prints rows as they come."""
+    """Prints rows as they are measured, and passes them on."""
     began = time.perf_counter()
     for row in rows:
         where = " ".join(f"{row[key]:>6,} {key}" for key in ("faces", "batch") if key in row)
         where += f" {row['network']}" if "network" in row else ""
         if "note" in row:
-            said = f"{row.get('reference', '')} {row['note']}".strip()
+            text = f"{row.get('reference', '')} {row['note']}".strip()
         elif "median_ms" in row:
-            said = f"{row.get('min_ms', row['median_ms']):10.2f} ms"
-            said += f"   {row['ratio']:8.2f} x {row['reference']}" if "ratio" in row else ""
-            said += f"   {row['achieved']:.0%} of the roofline" if "achieved" in row else ""
+            text = f"{row.get('min_ms', row['median_ms']):10.2f} ms"
+            text += f"   {row['ratio']:8.2f} x {row['reference']}" if "ratio" in row else ""
+            text += f"   {row['achieved']:.0%} of the roofline" if "achieved" in row else ""
         elif "reached" in row and "warp_launches" not in row:
-            said = ""
+            text = ""
         else:
-            said = ", ".join(
+            text = ", ".join(
                 f"{k} {v:g}"
                 for k, v in row.items()
                 if isinstance(v, (int, float)) and k not in ("faces", "batch", "met")
             )
         if "target" in row:
-            said += f"   {'met' if row['met'] else 'MISSED'}: {row['target']} ({row['reached']})"
-        print(f"{time.perf_counter() - began:6.0f} s  {where:<22} {row['what']:<36} {said}", flush=True)
+            text += f"   {'met' if row['met'] else 'MISSED'}: {row['target']} ({row['reached']})"
+        print(f"{time.perf_counter() - began:6.0f} s  {where:<22} {row['what']:<36} {text}", flush=True)
         yield row
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs what was asked for and writes the results."""
+    """Runs the parts that the arguments name and writes the results."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run")
     parser.add_argument("--faces", type=int, nargs="+", help="sizes of the garment")

@@ -21,15 +21,15 @@ from warpgarment.sim.state import SimulationState
 CPU_BATCH = (1, 2, 4, 8, 16)
 GPU_BATCH = (1, 4, 16, 64, 256, 1024, 4096)
 LOOP = 16  # largest batch that is also simulated one by one
-START, STARTS = 40, 8  # frames of the walk at which bodies of a batch begin
-WALK = 12  # frames, there and back
-LONGEST = 6.0  # seconds that a frame may take, by the batch before it
+START, STARTS = 40, 8  # first frame of the walk at which a body begins, and number of such frames
+WALK = 12  # number of frames that are played forth and back
+LONGEST = 6.0  # largest time of a frame, estimated from the batch before it [s]
 
 
 class Rolling:
-    """A simulation that can be asked for the next frame again and again: the bodies walk, and walk back.
+    """A simulation of any number of frames: the bodies walk, and walk back.
 
-    On a GPU the bodies lie there beforehand: how fast a host can send them is another question.
+    On a GPU the bodies are uploaded beforehand, so that the time of the transfer is not measured.
     """
 
     def __init__(self, simulator: Simulator, scenes: Sequence[Dressed]) -> None:
@@ -46,7 +46,7 @@ class Rolling:
             self.sent = [simulator._positions(positions) for positions in walk]
 
     def __call__(self) -> None:
-        """One frame."""
+        """Simulates one frame."""
         frame = next(self.order)
         if self.sent:
             self.state = self.simulator._advance(self.state, self.sent[frame])
@@ -55,7 +55,7 @@ class Rolling:
 
 
 def scenes_of(sizes: Sequence[int], number: int) -> list[Dressed]:
-    """Garments of these sizes in turn, on bodies that begin at different frames of the walk."""
+    """A number of garments with the given numbers of faces in turn, on bodies that begin at different frames."""
     return [dressed(sizes[k % len(sizes)], start=START + k % STARTS) for k in range(number)]
 
 
@@ -107,22 +107,22 @@ def _series(sizes: Sequence[int], batches: Sequence[int], simulator: Simulator, 
         each = min(times["packed"]) / _frames(device) / number / 1e3
         row = base | figures(times["packed"], 1.0 / number / _frames(device)) | {"memory_mb": need.total / 1e6}
         if "loop" in calls:
-            theirs = figures(times["loop"], 1.0 / number / _frames(device))
+            loop = figures(times["loop"], 1.0 / number / _frames(device))
             row |= {"reference": "Python loop over garments"}
-            row |= {f"reference_{key}": value for key, value in theirs.items()}
-            row["ratio"] = theirs["min_ms"] / row["min_ms"]
+            row |= {f"reference_{key}": value for key, value in loop.items()}
+            row["ratio"] = loop["min_ms"] / row["min_ms"]
         row["spent_s"] = round(time.perf_counter() - began, 1)
         yield row
 
 
 def _stages(size: int, simulator: Simulator) -> Iterator[Row]:
-    """Where the time of a frame goes, for one garment; the mean of a few frames."""
+    """The time of a frame by stage for one garment, as the mean of a few frames."""
     rolling = Rolling(simulator, scenes_of([size], 1))
     simulator.timings.synchronise = True
     rolling()
     simulator.timings.clear()
     frames = 4
-    # processor time on a CPU, as everywhere here
+    # processor time on a CPU, as in all measurements here
     clock = time.process_time if simulator.device.type == "cpu" else time.perf_counter
     with mock.patch("warpgarment.sim.timing.time.perf_counter", clock):
         for _ in range(frames):
@@ -135,7 +135,7 @@ def _stages(size: int, simulator: Simulator) -> Iterator[Row]:
 
 
 def _frames(device: torch.device) -> int:
-    """Frames per timed call: a GPU is not waited for between them."""
+    """Number of frames per timed call; a GPU is not synchronised between them."""
     return 1 if device.type == "cpu" else 16
 
 

@@ -1,4 +1,4 @@
-"""Slow and exact answers in float64, to hold fast ones against."""
+"""Slow and exact results in float64, with which fast ones are compared."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ def signed_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray)
     The winding number is the sum of the triangles' solid angles (Van Oosterom and Strackee 1983) over 4 pi.
 
     Args:
-        points: Shape [N,3].
-        vertices: Shape [U,3].
-        faces: Shape [G,3].
+        points: Points [m], shape [N,3].
+        vertices: Vertices of the mesh [m], shape [U,3].
+        faces: Vertex indices, shape [G,3].
     """
     corners = np.asarray(vertices, np.float64)[faces]
     sides = np.roll(corners, -1, axis=1) - corners
@@ -34,7 +34,7 @@ def signed_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray)
 
 
 def _winding_number(corners: np.ndarray) -> float:
-    """Around the origin, of triangles [G,3,3]."""
+    """Winding number of triangles [G,3,3] around the origin."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     p, q, r = (np.linalg.norm(x, axis=1) for x in (a, b, c))
     volume = (a * np.cross(b, c)).sum(axis=1)
@@ -45,7 +45,7 @@ def _winding_number(corners: np.ndarray) -> float:
 def geodesics(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """Exact distances [m] over a mesh from the centroids of some faces to all, shape [S,F]; needs `pygeodesic`.
 
-    Each face is split in three at its centroid, which changes no distance, as the parts lie in its plane.
+    Each face is split in three at its centroid, which changes no distance, since the parts lie in its plane.
     """
     from pygeodesic.geodesic import PyGeodesicAlgorithmExact
 

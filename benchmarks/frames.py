@@ -1,4 +1,4 @@
-"""What happens within a frame: launches, operators, and whether the host waits for the device."""
+"""Counts within a frame: launches, operators, and waits of the host for the device."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from warpgarment.sim.simulator import Simulator
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "unique", "equal", "is_nonzero"}  # the host waits for these
 VIEWS = {"view", "unsqueeze", "expand", "slice", "select", "t", "transpose", "split", "split_with_sizes", "alias"}
 VIEWS |= {"_unsafe_view", "permute", "squeeze", "as_strided", "detach", "unbind", "lift_fresh", "_reshape_alias"}
-FRAMES = 8  # in the profile of a GPU
+FRAMES = 8  # number of frames in the profile of a GPU
 WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
 LAUNCHES = ("cudaLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernel", "cuLaunchKernelEx")
 
 
 class Operators(TorchDispatchMode):
-    """Counts torch operators, views left out, and lists the tensors that the host would wait for."""
+    """Counts torch operators except views, and lists the tensors for which the host would wait."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -47,12 +47,12 @@ class Operators(TorchDispatchMode):
 
 
 class FrameCounts:
-    """Counts what one frame does when every decision is left to the device, on whichever device.
+    """Counts within one frame in which the device takes every decision; the counts are the same on all devices.
 
     Attributes:
-        operators: Torch's.
-        launches: Warp's, by kernel; `refit` is one per body.
-        reads: Operators whose result the host would wait for.
+        operators: Number of calls of torch operators by name.
+        launches: Number of Warp launches by kernel; `refit` is one per body.
+        reads: Operators for whose result the host would wait.
     """
 
     def __init__(self, scene, now, next_body: torch.Tensor) -> None:
@@ -68,19 +68,19 @@ class FrameCounts:
         patches.append(mock.patch.object(wp.Mesh, "refit", counted_refit))
         patches.append(
             mock.patch.object(progress.Progress, "_warn", return_value=None)
-        )  # a CPU looks at reports at once
+        )  # a CPU would read reports immediately
         try:
             for patch in patches:
                 patch.start()
-            with torch.inference_mode(), Operators() as found:
+            with torch.inference_mode(), Operators() as seen:
                 advance(scene, now, next_body)
         finally:
             for patch in patches:
                 patch.stop()
             scene.early_exit = early
-        self.operators = found.counts
-        # sizes of the compliance matrices lie on the host
-        self.reads = [name for name, tensor in found.read if tensor.dtype != torch.int64 or tensor.numel() != 1]
+        self.operators = seen.counts
+        # Sizes of the compliance matrices are on the host.
+        self.reads = [name for name, tensor in seen.read if tensor.dtype != torch.int64 or tensor.numel() != 1]
 
     def _counted(self, original):
         def counted(kernel, *args, **options):
@@ -91,7 +91,7 @@ class FrameCounts:
 
 
 def rows(faces: int, batches: Sequence[int], device: torch.device, networks: Sequence[Named]) -> Iterator[Row]:
-    """Counts per frame for each batch; on a GPU also what torch's profiler saw of frames with and without a graph."""
+    """Counts per frame for each batch; on a GPU also calls in torch's profile of frames with and without a graph."""
     for named in networks:
         for row in _rows(faces, batches, device, named):
             yield row | {"network": named.label}
@@ -104,9 +104,9 @@ def _rows(faces: int, batches: Sequence[int], device: torch.device, named: Named
         rolling = Rolling(simulator, scenes)
         rolling()
         bodies = simulator._positions([scene.body.vertices[2] for scene in scenes])
-        found = FrameCounts(rolling.state.scene, rolling.state.now, bodies)
-        refits = found.launches.pop("refit", 0)
-        launches, reads = sum(found.launches.values()), len(found.reads)
+        counts = FrameCounts(rolling.state.scene, rolling.state.now, bodies)
+        refits = counts.launches.pop("refit", 0)
+        launches, reads = sum(counts.launches.values()), len(counts.reads)
         alone = alone or launches
         row = {
             "part": "profile",
@@ -114,7 +114,7 @@ def _rows(faces: int, batches: Sequence[int], device: torch.device, named: Named
             "faces": len(scenes[0].garment.faces),
             "batch": number,
             "warp_launches": launches,
-            "torch_operators": sum(found.operators.values()),
+            "torch_operators": sum(counts.operators.values()),
             "refits": refits,
             "host_reads": reads,
         }
@@ -130,7 +130,7 @@ def _rows(faces: int, batches: Sequence[int], device: torch.device, named: Named
 
 
 def _profiled(faces: int, number: int, device: torch.device, named: Named, graph: bool) -> Row:
-    """Calls of the CUDA runtime per frame, as the profiler saw them."""
+    """Calls of the CUDA runtime per frame in torch's profile."""
     rolling = Rolling(Simulator(named.network, device, graph=graph), scenes_of([faces], number))
     for _ in range(WARM_UP + 2):
         rolling()

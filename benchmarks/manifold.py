@@ -25,13 +25,13 @@ from warpgarment.objects.pack import PackedGarments
 
 from . import exact
 
-SOURCES = 4  # faces whose distances are held against exact ones
-ROWS = 64  # of the pooled weights that are held against dense ones
-POOLED_FROM = 9_000  # faces from which pooled weights are timed too, though garments use them beyond 10,000 only
+SOURCES = 4  # number of faces whose distances are compared with exact ones
+ROWS = 64  # number of rows of the pooled weights that are compared with dense ones
+POOLED_FROM = 9_000  # number of faces from which pooled weights are timed, too; garments use them beyond 10,000 only
 
 
 def geodesics(sizes: Sequence[int]) -> Iterator[Row]:
-    """Distances between all faces of a garment: computed once, and read from disk. Later parts use them."""
+    """Rows on distances between all faces of a garment, computed once and read from disk; later parts use them."""
     for number, size in enumerate(sizes):
         garment = remeshed(size)[0]
         count = len(garment.faces)
@@ -70,7 +70,7 @@ def _once(call: Call) -> Row:
 
 @torch.inference_mode()
 def heads(garment: Garment, device: torch.device, seconds: float) -> Iterator[Row]:
-    """Two manifold heads of a layer of `small` or `fast`, projections too, against softmax(-(D/r)^p) V of all pairs."""
+    """Rows on two manifold heads of a layer with projections, against softmax(-(D/r)^p) V of all pairs."""
     config, fast = NetworkConfig.small(), NetworkConfig.fast()
     head = config.embedding // config.heads
     attention = ManifoldAwareAttention(2 * head, 2, 2, 0.0).to(device).eval()
@@ -93,7 +93,7 @@ def heads(garment: Garment, device: torch.device, seconds: float) -> Iterator[Ro
 
     def dense() -> object:
         value = torch.nn.functional.linear(tokens, attention.qkv.weight[-2 * head :], attention.qkv.bias[-2 * head :])
-        scores = [  # each head its own softmax over all pairs, as attention does it
+        scores = [  # each head has its own softmax over all pairs, as in attention
             torch.softmax(-((distances / config.geodesic_radius) ** config.geodesic_power), dim=-1) @ part
             for part in value[0].split(head, dim=-1)
         ]
@@ -106,7 +106,7 @@ def heads(garment: Garment, device: torch.device, seconds: float) -> Iterator[Ro
 
 
 def _pooling(garment: Garment, distances: torch.Tensor, device: torch.device) -> Iterator[Row]:
-    """How far pooled weights are off the dense ones: rows' L1 norm, on a subset of faces as the network sees one."""
+    """Difference between pooled and dense weights in rows' L1 norm, on such a subset of faces as a network reads."""
     subset = np.arange(0, len(garment.faces), 2)
     part = distances[::2, ::2]
     chosen = np.linspace(0, len(subset) - 1, ROWS).astype(int)

@@ -1,4 +1,4 @@
-"""Timing calls side by side, and saying what they were timed on."""
+"""Timing of calls side by side, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Call = Callable[[], object]
 
 
 class Times(list[float]):
-    """Milliseconds of each call: of the processor on a CPU, by the clock on a GPU; `wall` is by the clock for both."""
+    """Times of calls [ms]: processor time on a CPU, clock time on a GPU; `wall` is clock time for both."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,16 +33,17 @@ class Times(list[float]):
 def interleaved(
     calls: dict[str, Call], device: torch.device, seconds: float, least: int = 3, most: int = 200
 ) -> dict[str, Times]:
-    """Times of calls that take turns, so that what else the machine does disturbs all of them [ms].
+    """Times of calls that take turns [ms], so that other work on the machine affects all of them.
 
-    On a CPU the processor's time is taken, all threads together: what a call costs on one core, whoever else is there.
+    On a CPU processor time is measured, summed over all threads: the cost of a call on one core, regardless of other
+    processes.
 
     Args:
-        calls: By name. Each runs once before, unless that alone took `seconds`.
-        device: Waited for around every call.
-        seconds: Rounds are begun until so much time has passed for each call,
-        least: but at least so many, unless that takes four times as long,
-        most: and at most so many.
+        calls: Calls by name. Each runs once untimed before, except one for which that run alone took `seconds`.
+        device: Device, which is synchronised around every call.
+        seconds: Time after which no further round is begun, per call [s].
+        least: Least number of rounds, unless they take four times as long as `seconds`.
+        most: Largest number of rounds.
     """
 
     spent = {name: Times() for name in calls}
@@ -60,7 +61,7 @@ def interleaved(
 
     for name in calls:
         take(name)
-        if spent[name].wall[0] < 1e3 * seconds:  # it warmed up
+        if spent[name].wall[0] < 1e3 * seconds:  # the first run was the warm-up
             spent[name].clear()
             spent[name].wall.clear()
     began, rounds = time.perf_counter(), 0
@@ -74,7 +75,7 @@ def interleaved(
 
 
 def figures(times: Times, share: float = 1.0) -> Row:
-    """Least and median of times [ms], times a share (one over the garments of a batch, say)."""
+    """Least and median of times [ms], multiplied by a share, such as one over the number of garments of a batch."""
     least, median = share * min(times), share * statistics.median(times)
     return {"min_ms": least, "median_ms": median, "wall_ms": share * min(times.wall), "runs": len(times)}
 
@@ -86,15 +87,20 @@ def compared(
     device: torch.device,
     seconds: float,
 ) -> list[Row]:
-    """One row of ours, and one for each reference with the ratio of least times; a reference may be a note instead.
+    """One row of this project's call, and one for each reference with the ratio of least times.
 
-    Several calls of ours, by the `what` of their rows, share the references.
+    Args:
+        base: Entries that all rows have.
+        ours: Call of this project, or several ones by the `what` of their rows, which share the references.
+        references: References by name: a call, or a note on why there is none.
+        device: Device, which is synchronised around every call.
+        seconds: Time spent on each call [s].
     """
-    mine = {str(base["what"]): ours} if callable(ours) else ours
+    own = {str(base["what"]): ours} if callable(ours) else ours
     calls = {name: call for name, call in references.items() if callable(call)}
-    times = interleaved({f"ours: {what}": call for what, call in mine.items()} | calls, device, seconds)
+    times = interleaved({f"ours: {what}": call for what, call in own.items()} | calls, device, seconds)
     rows = []
-    for what in mine:
+    for what in own:
         row = base | {"what": what} | figures(times[f"ours: {what}"])
         if not calls:
             rows.append(row)
@@ -102,19 +108,27 @@ def compared(
             if isinstance(call, str):
                 rows.append(base | {"what": what, "reference": name, "note": call})
                 continue
-            theirs = {f"reference_{key}": value for key, value in figures(times[name]).items()}
-            rows.append(row | {"reference": name} | theirs | {"ratio": theirs["reference_min_ms"] / row["min_ms"]})
+            other = {f"reference_{key}": value for key, value in figures(times[name]).items()}
+            rows.append(row | {"reference": name} | other | {"ratio": other["reference_min_ms"] / row["min_ms"]})
     return rows
 
 
 def aimed(row: Row, target: str, reached: str, met: bool) -> Row:
-    """A row with a target beside it, if it was measured."""
+    """A row with a target, the reached figure and whether the target is met, if the row was measured."""
     return row if "note" in row else row | {"target": target, "reached": reached, "met": bool(met)}
 
 
 def aimed_time(row: Row, limit: float, faces: int, power: float = 1.0, *, key: str = "median_ms", how: str = "") -> Row:
-    """A row whose median, or another time that `how` describes, is to stay under a limit [ms], scaled by a power of
-    the faces to the number that was named."""
+    """A row whose time must stay under a limit.
+
+    Args:
+        row: The row.
+        limit: Limit [ms] for the number of faces `faces`.
+        faces: Number of faces for which the limit is given.
+        power: Power of the number of faces with which the row's time is scaled to that number.
+        key: Entry of the row that holds the time [ms].
+        how: Description of the time, if it is not the median.
+    """
     if "note" in row:
         return row
     scaled = row[key] * (faces / row["faces"]) ** power
@@ -124,12 +138,12 @@ def aimed_time(row: Row, limit: float, faces: int, power: float = 1.0, *, key: s
 
 
 def tensor(array: np.ndarray, device: torch.device, dtype: type[np.generic] = np.float32) -> torch.Tensor:
-    """A copy of an array on the device."""
+    """A copy of an array on a device, converted to the dtype."""
     return torch.as_tensor(np.array(array, dtype=dtype, order="C"), device=device)
 
 
 def installed(package: str) -> str | None:
-    """Version of a package, None where it is not installed."""
+    """Version of a package; None if it is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -137,7 +151,7 @@ def installed(package: str) -> str | None:
 
 
 def processor() -> str:
-    """The name of the CPU, as the system gives it."""
+    """The name of the CPU, as reported by the system."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -146,7 +160,7 @@ def processor() -> str:
 
 
 def machine(device: torch.device) -> dict[str, str]:
-    """What the figures were measured on."""
+    """The machine and the versions of packages of a measurement."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else processor()
     versions = {package: installed(package) or "not installed" for package in PACKAGES}
     threads = {"torch threads": str(torch.get_num_threads()), "cores": str(os.cpu_count())}

@@ -1,4 +1,4 @@
-"""The networks whose speed is measured: trained ones, or shapes without training, which are as fast."""
+"""The networks whose speed is measured: trained ones, or untrained ones of a shape, which are as fast."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ DEFAULT = ("small", "fast")
 
 
 class Named(NamedTuple):
-    """A network and what rows call it."""
+    """A network and its label in rows."""
 
     label: str
     network: GarmentNetwork
 
 
 def named(names: Sequence[str]) -> list[Named]:
-    """Networks by name: one that ships, or a file; `small`, `fast` or `base` that does not ship is made untrained.
+    """Networks by name: a bundled one, or a file; `small`, `fast` or `base` is made untrained if it is not bundled.
 
     An untrained network of `small` or `fast` moves the cloth as the body moves; that of `base` moves it anywhere, so
     that its collisions take longer than a trained one's.

@@ -32,7 +32,7 @@ INTRODUCTIONS = {
 
 
 def markdown(about: dict[str, str], command: str, rows: Sequence[Row]) -> str:
-    """The results as tables, a part each."""
+    """The results as tables in Markdown, one per part."""
     lines = ["# " + ", ".join(f"{k} {v}" for k, v in about.items()), "", f"`{command}`", ""]
     lines += [
         "Milliseconds, least and median: of the processor on a CPU, all threads together; by the clock on a GPU.",
@@ -40,16 +40,16 @@ def markdown(about: dict[str, str], command: str, rows: Sequence[Row]) -> str:
     ]
     lines += _targets([row for row in rows if "target" in row])
     for part, title in TITLES.items():
-        mine = [row for row in rows if row["part"] == part]
-        if not mine:
+        of_part = [row for row in rows if row["part"] == part]
+        if not of_part:
             continue
         lines += [f"## {title}", "", INTRODUCTIONS[part], ""]
         if part == "profile":
-            lines += _profile(mine)
+            lines += _profile(of_part)
         elif part == "roofline":
-            lines += _roofline(mine)
+            lines += _roofline(of_part)
         else:
-            lines += _times([row for row in mine if "min_ms" in row or "median_ms" in row or "note" in row])
+            lines += _times([row for row in of_part if "min_ms" in row or "median_ms" in row or "note" in row])
         lines.append("")
     return "\n".join(lines)
 
@@ -68,7 +68,7 @@ def _targets(rows: Sequence[Row]) -> list[str]:
 
 
 def _times(rows: Sequence[Row]) -> list[str]:
-    """Columns that no row has are left out."""
+    """A table of times; columns that no row has are left out."""
     columns = {
         "faces": lambda row: _count(row, "faces"),
         "batch": lambda row: _count(row, "batch"),
@@ -149,7 +149,7 @@ def _off(row: Row, key: str) -> str:
 
 
 def plot(path: Path, about: dict[str, str], rows: Sequence[Row]) -> None:
-    """Draws the parts that were run: ratios by stage, time over batch, roofline."""
+    """Draws the measured parts: ratios by stage, time over batch, roofline."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -174,9 +174,9 @@ def _ratios(axis, rows: Sequence[Row]) -> None:
     names = list(dict.fromkeys(name(row) for row in rows))
     sizes = sorted({row["faces"] for row in rows})
     for k, size in enumerate(sizes):
-        found = {name(row): row["ratio"] for row in rows if row["faces"] == size}
-        at = [i + 0.8 * (k + 0.5) / len(sizes) - 0.4 for i, n in enumerate(names) if n in found]
-        axis.plot([found[n] for n in names if n in found], at, "o", markersize=5, label=f"{size:,} faces")
+        ratios = {name(row): row["ratio"] for row in rows if row["faces"] == size}
+        at = [i + 0.8 * (k + 0.5) / len(sizes) - 0.4 for i, n in enumerate(names) if n in ratios]
+        axis.plot([ratios[n] for n in names if n in ratios], at, "o", markersize=5, label=f"{size:,} faces")
     axis.set_yticks(range(len(names)), names, fontsize=6)
     axis.grid(axis="x", alpha=0.3)
     axis.invert_yaxis()
@@ -192,12 +192,12 @@ def _batches(axis, rows: Sequence[Row]) -> None:
     networks = list(dict.fromkeys(row["network"] for row in rows))
     for k, size in enumerate(sorted({row["faces"] for row in rows})):
         for network, style in zip(networks, ("-", "--", ":", "-.") * len(networks), strict=False):
-            mine = [row for row in rows if row["faces"] == size and row["network"] == network]
-            mine.sort(key=lambda row: row["batch"])
-            batches, drawn = [row["batch"] for row in mine], {"color": f"C{k % 10}"}
+            series = [row for row in rows if row["faces"] == size and row["network"] == network]
+            series.sort(key=lambda row: row["batch"])
+            batches, drawn = [row["batch"] for row in series], {"color": f"C{k % 10}"}
             label = f"{size:,} faces, {network}"
-            axis.plot(batches, [row["min_ms"] for row in mine], "o", linestyle=style, label=label, **drawn)
-            loops = [row for row in mine if "ratio" in row]
+            axis.plot(batches, [row["min_ms"] for row in series], "o", linestyle=style, label=label, **drawn)
+            loops = [row for row in series if "ratio" in row]
             drawn |= {"marker": "x", "linestyle": "none"}
             axis.plot([row["batch"] for row in loops], [row["reference_min_ms"] for row in loops], **drawn)
     axis.set_xscale("log", base=2)
@@ -219,11 +219,11 @@ def _roofs(axis, rows: Sequence[Row]) -> None:
         roof = np.minimum(rates[name], intensity * rates["copy"])
         axis.plot(intensity, roof / 1e9, color=colour, label=f"{name}, measured roof")
         for network, marker in zip(networks, "o^sD" * len(networks), strict=False):
-            mine = [row for row in points if row["what"].endswith(name) and row["network"] == network]
-            at = [row["operations"] / row["bytes"] for row in mine]
-            rates_of = [row["rate"] / 1e9 for row in mine]
+            series = [row for row in points if row["what"].endswith(name) and row["network"] == network]
+            at = [row["operations"] / row["bytes"] for row in series]
+            rates_of = [row["rate"] / 1e9 for row in series]
             axis.scatter(at, rates_of, color=colour, s=18, marker=marker, label=f"{name}, {network}")
-            for x, y, row in zip(at, rates_of, mine, strict=True):
+            for x, y, row in zip(at, rates_of, series, strict=True):
                 place = {"xytext": (4, -8), "textcoords": "offset points", "fontsize": 5, "color": colour}
                 axis.annotate(f"{row['faces']:,} x {row['batch']}", (x, y), **place)
     axis.set_xscale("log")

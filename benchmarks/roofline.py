@@ -1,19 +1,19 @@
-"""The network against the device: operations and bytes, and what the device does of either at best.
+"""The network against the device: operations and bytes, and the highest rates of the device for both.
 
-Operations are those of `warpgarment.nn.flops`, forward. Bytes are the fewest that the layers as written need when
+Operations are those of `warpgarment.nn.flops`, forward. Bytes are the least number for the layers as written, in which
 every operator reads its inputs and writes its outputs once: per token and layer, in units of the embedding E,
 
     norms 4, q, k, v 1 + 3 - 2 m, attention 4 - 2 m, output 2, residual sums 6, feed-forward 2 + 4 W/E
 
-with m the share of manifold heads and W the feed-forward width, plus all parameters once, the geodesic weights once a
+with m the share of manifold heads and W the feed-forward width, plus all parameters once, the geodesic weights once per
 layer, and the stacked features. In a network of patches these tokens are the patches; per face, of width F in K face
-layers of hidden width G,
+layers of hidden width G, it is
 
     embedding 1, pooling 1, spreading 4, answer 3 + 12/F, the layer before 7 + 4 G/F, each after 10 + 8 G/F
 
-in units of F, the indices and shares of pools and neighbours once, and per patch 3 F + 5 E for the way to its width and
-back. The floor of a call is the larger of operations over the matrix rate and bytes over the copy bandwidth, both
-measured here in the same run; the achieved share is that floor over the measured time.
+in units of F, the indices and shares of pools and neighbours once, and per patch 3 F + 5 E for the change to its width
+and back. The least time of a call is the larger of operations over the matrix rate and bytes over the copy bandwidth,
+both measured in one run; the achieved share is that time over the measured one.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from warpgarment.sim.simulator import Simulator
 
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 MATRIX = {"cpu": 1536, "cuda": 8192}
-COPIED = {"cpu": 2**28, "cuda": 2**30}  # bytes
-TOKENS = {"cpu": 8192, "cuda": 131_072}  # faces in a batch
+COPIED = {"cpu": 2**28, "cuda": 2**30}  # size of the copy that is timed [bytes]
+TOKENS = {"cpu": 8192, "cuda": 131_072}  # largest number of faces in a batch
 
 
 def network_bytes(
     config: NetworkConfig, faces: int, components: int, batch: int, parameters: int, size: int, patches: int = 0
 ) -> int:
-    """Bytes as counted above; `size` of a number."""
+    """Bytes as counted in the module's docstring; `size` is that of a number in bytes."""
     e, nodes = config.embedding, patches or faces
     manifold = config.manifold_heads / config.heads
     layer = e * (4 + (4 - 2 * manifold) + (4 - 2 * manifold) + 2 + 6 + 2) + 4 * config.feed_forward
@@ -61,7 +61,7 @@ def network_bytes(
 
 
 def device_rates(device: torch.device, seconds: float) -> dict[str, float]:
-    """Measured: operations per second of a large matrix product by precision, bytes per second of a large copy."""
+    """Measured rates: operations per second of a large matrix product by precision, bytes per second of a copy."""
     n, rates = MATRIX[device.type], {}
     for name, dtype in PRECISIONS.items():
         a, b = (torch.randn(n, n, device=device).to(dtype) for _ in range(2))
@@ -71,7 +71,7 @@ def device_rates(device: torch.device, seconds: float) -> dict[str, float]:
     source = torch.randn(COPIED[device.type] // 4, device=device)
     target = torch.empty_like(source)
     times = interleaved({"copy": lambda: target.copy_(source)}, device, seconds)
-    rates["copy"] = 2e3 * COPIED[device.type] / min(times["copy"])  # read and written
+    rates["copy"] = 2e3 * COPIED[device.type] / min(times["copy"])  # bytes that are read and bytes that are written
     return rates
 
 

@@ -14,12 +14,12 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.training.meshes.cutting import without_short_edges
 
-MOST_REMESHED = 100_000  # faces; remeshing further leaves faces without area, so each face is cut into four instead
+MOST_REMESHED = 100_000  # largest number of faces by remeshing; beyond it each face is cut into four instead
 
 
 @dataclass(frozen=True)
 class Dressed:
-    """A garment and two frames of it on a moving body, and the first frame pressed 6 mm into the body."""
+    """A garment on a moving body: vertices in two frames, and the first frame pressed 6 mm into the body, [V,3] [m]."""
 
     garment: Garment
     body: BodyMotion
@@ -30,7 +30,7 @@ class Dressed:
 
 @lru_cache(maxsize=8)
 def remeshed(faces: int, name: str = "dress") -> tuple[Garment, np.ndarray, np.ndarray]:
-    """The bundled garment with about `faces` faces; the old face and the barycentric coordinates of each new vertex."""
+    """The bundled garment with about `faces` faces; old face of each new vertex, and barycentric coordinates on it."""
     item = demo.assets().garments[name]
     rest, old = item.garment.vertices.astype(np.float64), item.garment.faces.astype(np.int64)
     if faces > MOST_REMESHED:
@@ -50,7 +50,7 @@ def remeshed(faces: int, name: str = "dress") -> tuple[Garment, np.ndarray, np.n
 
 @lru_cache(maxsize=64)
 def dressed(faces: int, name: str = "dress", start: int = 40) -> Dressed:
-    """The bundled garment with about `faces` faces on the body from a frame of the walk on."""
+    """The bundled garment with about `faces` faces, on the body from frame `start` of the walk on."""
     garment, nearest, weights = remeshed(faces, name)
     bundle = demo.assets()
     item = bundle.garments[name]

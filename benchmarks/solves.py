@@ -21,13 +21,13 @@ from warpgarment.objects.garment import Garment
 from warpgarment.training.bodies.limb_clearance import TOLERANCE
 
 NOT_INSTALLED = "not installed"
-EPSILON = 0.004  # metres kept from the body
-PASSES = 4  # of the refinement, as many as a frame has at most
+EPSILON = 0.004  # distance kept from the body [m]
+PASSES = 4  # number of passes of the refinement, the largest in a frame
 SYMMETRIC = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
 
 def poisson(scene: Dressed, device: torch.device, seconds: float) -> Iterator[Row]:
-    """The solve for the next frame from the present one; references are given a right-hand side and a factor."""
+    """Rows on the solve for the next frame from the present one; references get the right-hand side and a factor."""
     garment = scene.garment
     rest, triangles, posed = tensor(garment.vertices, device), tensor(garment.faces, device, np.int32), scene.first
     inverse = deformation.inverse_rest_frames(rest, triangles)
@@ -40,7 +40,7 @@ def poisson(scene: Dressed, device: torch.device, seconds: float) -> Iterator[Ro
     rest_host, index = garment.vertices.astype(np.float64), garment.faces.astype(np.int64)
     matrix = (-igl.cotmatrix(rest_host, index)).tocsc()
     _, first = np.unique(garment.components[0], return_index=True)
-    ground = np.zeros(len(rest_host))  # holds one vertex of each component: the solution's translation
+    ground = np.zeros(len(rest_host))  # holds one vertex of each component, which fixes its translation
     ground[first] = matrix.diagonal().max()
     matrix = (matrix + sp.diags(ground)).tocsc()
     areas = np.tile(0.5 * igl.doublearea(rest_host, index), 3)
@@ -70,12 +70,12 @@ def poisson(scene: Dressed, device: torch.device, seconds: float) -> Iterator[Ro
     if 8_000 < len(index) < 12_000 and device.type == "cpu":
         rows[0] = aimed_time(rows[0], 1.5, 10_000)
     yield from rows
-    found = {"part": "stages", "faces": len(index), "what": "Poisson solve, off the direct solution", "error_mm": error}
-    yield aimed(found, "under 0.01 mm", f"{error:.1e} mm", error < 0.01)
+    check = {"part": "stages", "faces": len(index), "what": "Poisson solve, off the direct solution", "error_mm": error}
+    yield aimed(check, "under 0.01 mm", f"{error:.1e} mm", error < 0.01)
 
 
 def collisions(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds: float) -> Iterator[Row]:
-    """The refinement of a garment pressed 6 mm into its body; references are given the contacts and the matrix."""
+    """Rows on the refinement of a garment pressed 6 mm into its body; references get the contacts and the matrix."""
     garment = scene.garment
     rest, triangles = tensor(garment.vertices, device), tensor(garment.faces, device, np.int32)
     pressed, refiner = tensor(scene.pressed, device), CollisionSolver(rest, triangles)
@@ -116,8 +116,8 @@ def collisions(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds
         reached = f"{row['ratio']:.1f} x" if "ratio" in row else ""
         wanted = device.type == "cpu"
         yield aimed(row, "8 x faster than refactoring", reached, row.get("ratio", 0.0) >= 8.0) if wanted else row
-    found = {"part": "stages", "faces": len(garment.faces), "what": "collisions, off the minimiser", "error_mm": error}
-    yield aimed(found, "under 0.02 mm", f"{error:.1e} mm", error < 0.02)
+    check = {"part": "stages", "faces": len(garment.faces), "what": "collisions, off the minimiser", "error_mm": error}
+    yield aimed(check, "under 0.02 mm", f"{error:.1e} mm", error < 0.02)
 
     base = {"part": "stages", "faces": len(garment.faces), "what": f"collisions, {PASSES} passes"}
     deepest = -float(bodies.query(refiner.refine(pressed, bodies, epsilon=EPSILON, passes=PASSES)).distance.min())
@@ -128,7 +128,7 @@ def collisions(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds
 
 
 def _with_means(solution: np.ndarray, garment: Garment, means: np.ndarray) -> np.ndarray:
-    """Positions [V,3] with each component moved to where the mean of its face centroids [C,3] is wanted."""
+    """Positions [V,3] with each component moved so that the mean of its face centroids is the wanted one, [C,3]."""
     _, of_face, count = garment.components
     centroids, sizes = solution[garment.faces].mean(axis=1), np.bincount(of_face, minlength=count)
     mean = np.stack([np.bincount(of_face, weights=c, minlength=count) for c in centroids.T], axis=1) / sizes[:, None]

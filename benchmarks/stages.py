@@ -1,4 +1,4 @@
-"""The kernels one by one, on the bundled dress remeshed to a number of faces, each against the published way."""
+"""The kernels one by one, on the bundled dress remeshed to a number of faces, each against the published method."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from . import exact, manifold, solves
 
-SAMPLE = 256  # points whose distances are held against brute force
-LARGEST = 50_000  # faces up to which the Poisson solve is promised
+SAMPLE = 256  # number of points whose distances are compared with brute force
+LARGEST = 50_000  # largest number of faces for which the Poisson solve has a target
 
 
 def all_rows(sizes: Sequence[int], large: bool, device: torch.device, seconds: float) -> Iterator[Row]:
@@ -74,7 +74,7 @@ def _deformations(scene: Dressed, device: torch.device, seconds: float) -> Itera
 
 
 def _distances(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds: float) -> Iterator[Row]:
-    """From face centroids as the network sees them, and from vertices as the collisions ask for them."""
+    """Rows on distances from face centroids, for the network, and from vertices, for the collisions."""
     triangles, posed = tensor(scene.garment.faces, device, np.int32), tensor(scene.first, device)
     centroids, body = deformation.face_centroids(posed, triangles), tensor(scene.body.vertices[0], device)
     body_host, body_faces = scene.body.vertices[0].astype(np.float64), scene.body.faces.astype(np.int64)
@@ -91,19 +91,19 @@ def _distances(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds
 
     chosen = np.linspace(0, len(points) - 1, min(SAMPLE, len(points))).astype(int)
     truth = exact.signed_distance(points[chosen], body_host, body_faces)
-    mine = 1e3 * float(np.abs(ours().cpu().numpy()[chosen] - truth).max())
-    theirs = 1e3 * float(np.abs(libigl(points)[chosen] - truth).max())
-    base |= {"what": "signed distance, refit included", "error_mm": mine, "reference_error_mm": theirs}
+    error = 1e3 * float(np.abs(ours().cpu().numpy()[chosen] - truth).max())
+    reference_error = 1e3 * float(np.abs(libigl(points)[chosen] - truth).max())
+    base |= {"what": "signed distance, refit included", "error_mm": error, "reference_error_mm": reference_error}
     for row in compared(base, ours, {"libigl fast winding number": lambda: libigl(points)}, device, seconds):
-        reached = f"{row['ratio']:.2f} x; {mine:.1e} mm beside {theirs:.1e} mm"
-        better = row["ratio"] >= 1.5 and mine <= theirs
+        reached = f"{row['ratio']:.2f} x; {error:.1e} mm beside {reference_error:.1e} mm"
+        better = row["ratio"] >= 1.5 and error <= reference_error
         yield aimed(row, "1.5 x faster than libigl, more exact", reached, better) if device.type == "cpu" else row
 
     base = {"part": "stages", "faces": len(triangles)}
-    asked, host = tensor(scene.pressed, device), scene.pressed.astype(np.float64)
+    pressed, host = tensor(scene.pressed, device), scene.pressed.astype(np.float64)
     calls: dict[str, Call] = {
-        "contact query, within 4 mm": lambda: bodies.query(asked, within=0.004),
-        "depth query, inside only": lambda: bodies.query(asked, within=0.0),
+        "contact query, within 4 mm": lambda: bodies.query(pressed, within=0.004),
+        "depth query, inside only": lambda: bodies.query(pressed, within=0.0),
     }
     yield from compared(
         base | {"what": "queries"}, calls, {"libigl fast winding number": lambda: libigl(host)}, device, seconds
@@ -127,14 +127,14 @@ def _features(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds:
     mean = centroids.mean(0, keepdim=True)
     base = {"part": "stages", "faces": len(triangles)}
 
-    def found():
+    def queried():
         return body_interaction(centroids, None, bodies, following)
 
-    interaction = found()
+    interaction = queried()
     yield from compared(
         base | {"what": "features of a frame, one launch"},
         lambda: frame_features(inverse, posed, triangles, owner, mean, None, bodies, following),
-        {"in two launches": lambda: face_features(inverse, posed, triangles, owner, mean, found())},
+        {"in two launches": lambda: face_features(inverse, posed, triangles, owner, mean, queried())},
         device,
         seconds,
     )

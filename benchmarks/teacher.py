@@ -1,4 +1,4 @@
-"""How fast a physics teacher simulates: garments of several sizes one at a time, and many worlds at once.
+"""Speed of a physics teacher: garments of several sizes one at a time, and many worlds at once.
 
     python -m benchmarks.teacher                                                # Newton on one core: 1k and 2k faces
     python -m benchmarks.teacher --teacher newton --device cpu --faces 1000 2000 --worlds 1 4
@@ -6,8 +6,8 @@
     python -m benchmarks.teacher --teacher blender
 
 The scene is the bundled dress, remeshed to each size, draped on the bundled body as it walks; worlds start at different
-frames of the walk. Building a model, compiling and the first frame are timed apart. What cannot run here is a row that
-says so. Results: benchmarks/results/teacher_<teacher>_<device>.json and .md.
+frames of the walk. Building a model, compiling and the first frame are timed separately. A case that cannot run on the
+machine is a row with a note. Results are in benchmarks/results/teacher_<teacher>_<device>.json and .md.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, 
 from warpgarment.view.markdown import table
 
 WORLDS = {"cpu": (1, 4), "cuda": (1, 4, 16, 64, 256, 1024)}
-STARTS = 24  # frames of the walk that worlds start at
+STARTS = 24  # number of frames of the walk at which worlds start
 
 
 @lru_cache(maxsize=4 * STARTS)
 def world(faces: int, frames: int, start: int) -> ClothScene:
-    """The dress on a stretch of the walk."""
+    """The dress with about `faces` faces on `frames` frames of the walk, from frame `start` on."""
     scene = dressed(faces, start=8 + start)
     ends = scene.garment.vertices[scene.garment.edges]
     edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
@@ -48,7 +48,7 @@ def world(faces: int, frames: int, start: int) -> ClothScene:
 
 
 def timed(teacher: Teacher, scenes: list[ClothScene]) -> tuple[float, float]:
-    """Seconds until the first frame is there, and seconds a frame after it."""
+    """Time until the first frame [s], and time per frame after it [s]."""
     began = time.perf_counter()
     stream = teacher.simulate_many(scenes)
     next(stream)
@@ -58,7 +58,7 @@ def timed(teacher: Teacher, scenes: list[ClothScene]) -> tuple[float, float]:
 
 
 def rows(teacher: str, device: str, sizes: list[int], worlds: list[int], frames: int) -> Iterator[dict[str, Any]]:
-    """One dictionary a measurement: faces, worlds, and either the times or a note why there are none."""
+    """One dictionary per measurement: faces, worlds, and either the times or a note why there are none."""
     for faces in sizes:
         for number in worlds if faces == sizes[0] else worlds[:1]:
             row: dict[str, Any] = {"teacher": teacher, "device": device, "faces": faces, "worlds": number}
@@ -69,7 +69,7 @@ def rows(teacher: str, device: str, sizes: list[int], worlds: list[int], frames:
             row["faces"] = len(scenes[0].cloths[0].garment.faces)
             try:
                 first, each = timed(make_teacher(teacher, device), scenes)
-            except (RuntimeError, MemoryError) as error:  # out of memory, say
+            except (RuntimeError, MemoryError) as error:  # for example, out of memory
                 yield row | {"note": f"not run: {str(error).splitlines()[0][:120] or type(error).__name__}"}
                 continue
             yield row | {
@@ -81,7 +81,7 @@ def rows(teacher: str, device: str, sizes: list[int], worlds: list[int], frames:
 
 
 def against(faces: list[int], device: torch.device, networks: Sequence[Named], frames: int) -> Iterator[Row]:
-    """Whole frames of the simulator and of Newton's VBD, the same garment on the same body, one at a time."""
+    """Rows on whole frames of the simulator and of Newton's VBD, with one garment on one body, one at a time."""
     for size in faces:
         scene = world(size, frames + 1, 32)
         base = {"part": "teacher", "what": "whole frame", "faces": len(scene.cloths[0].garment.faces), "batch": 1}
@@ -96,22 +96,22 @@ def against(faces: list[int], device: torch.device, networks: Sequence[Named], f
             f"ours: {label}": Rolling(Simulator(network, device), scenes_of([size], 1)) for label, network in networks
         }
         times = interleaved({**rolling, "VBD": lambda s=stream: next(s)}, device, 1e9, most=frames - 1)
-        theirs = {f"reference_{key}": value for key, value in figures(times["VBD"]).items()}
+        vbd = {f"reference_{key}": value for key, value in figures(times["VBD"]).items()}
         for label, _ in networks:
-            mine = figures(times[f"ours: {label}"])
-            ratio = theirs["reference_min_ms"] / mine["min_ms"]
-            yield base | {"network": label} | mine | reference | theirs | {"ratio": ratio}
+            own = figures(times[f"ours: {label}"])
+            ratio = vbd["reference_min_ms"] / own["min_ms"]
+            yield base | {"network": label} | own | reference | vbd | {"ratio": ratio}
 
 
 def settings(teacher: str) -> dict[str, Any]:
-    """Settings and versions of a teacher; empty where it is not there."""
+    """Settings and versions of a teacher; empty if it is not installed."""
     try:
         return make_teacher(teacher, "cpu").settings()
     except TeacherError:
         return {}
 
 
-def markdown(about: dict[str, str], command: str, found: list[dict[str, Any]]) -> str:
+def markdown(about: dict[str, str], command: str, done: list[dict[str, Any]]) -> str:
     """The results as a table."""
     lines = ["# " + ", ".join(f"{k} {v}" for k, v in about.items()), ""]
     lines += [
@@ -122,7 +122,7 @@ def markdown(about: dict[str, str], command: str, found: list[dict[str, Any]]) -
     lines += ["are per core. First frame: building, compiling and the first frame itself.", ""]
     names = ["teacher", "device", "faces", "worlds", "first frame s", "s a frame", "frames/s, all worlds"]
     cells = []
-    for row in found:
+    for row in done:
         shown = [row["teacher"], row["device"], f"{row['faces']:,}", f"{row['worlds']:,}"]
         if "note" in row:
             shown += [row["note"], "-", "-", "-"]
@@ -134,7 +134,7 @@ def markdown(about: dict[str, str], command: str, found: list[dict[str, Any]]) -
 
 
 def main() -> None:
-    """Runs what can be run on the device."""
+    """Runs all cases that the device can run, and writes the results."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--teacher", choices=TEACHERS, default="newton")
     parser.add_argument("--device", default="cpu")
@@ -148,14 +148,14 @@ def main() -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         torch.set_num_threads(1)
     worlds = options.worlds or list(WORLDS[kind])
-    found = []
+    done = []
     measured = rows(options.teacher, options.device, options.faces, worlds, options.frames + 1)
     if kind == "cpu" and options.teacher == "newton" and not torch.cuda.is_available():
         missing = rows(options.teacher, "cuda", options.faces[:1], list(WORLDS["cuda"]), options.frames + 1)
     else:
         missing = iter(())
     for row in (*measured, *missing):
-        found.append(row)
+        done.append(row)
         print(row.get("note") or f"{row['frames_per_s']:.2f} frames/s", {k: row[k] for k in ("faces", "worlds")})
     device = torch.device(kind if kind == "cpu" or torch.cuda.is_available() else "cpu")
     used = settings(options.teacher)
@@ -166,8 +166,8 @@ def main() -> None:
     )
     target = options.out / f"teacher_{options.teacher}_{options.device.replace(':', '')}"
     with atomic_files(target.with_suffix(".json"), target.with_suffix(".md")) as (data, page):
-        data.write_text(json.dumps({"machine": about, "command": command, "settings": used, "rows": found}, indent=1))
-        page.write_text(markdown(about, command, found))
+        data.write_text(json.dumps({"machine": about, "command": command, "settings": used, "rows": done}, indent=1))
+        page.write_text(markdown(about, command, done))
     print(f"written {target}.md")
 
 

@@ -1,15 +1,15 @@
-"""The physics teachers on the same scenes: drapes side by side, what can be measured of them, and known answers.
+"""The physics teachers on one set of scenes: drapes side by side, figures, and checks with known results.
 
     python -m benchmarks.teachers_side_by_side                        # both teachers, 60 frames
     python -m benchmarks.teachers_side_by_side --teachers blender     # only one of them
 
-Scenes: the bundled T-shirt and dress on the bundled walking body, and the T-shirt under a wider one; rest mesh, start,
-material and settling are the same for each teacher. Results: benchmarks/results/teachers.{png,json,md}.
+The scenes are the bundled T-shirt and dress on the bundled walking body, and the T-shirt under a wider one; rest mesh,
+start, material and settling are the same for each teacher. Results are in benchmarks/results/teachers.{png,json,md}.
 
-Stretch is the relative change of edge lengths, of either sign; a vertex is inside where its signed distance to the
+Stretch is the relative change of edge lengths, of either sign; a vertex is inside if its signed distance to the
 collider is negative (fast winding number); jitter is the mean length of the third difference in time over the cube of a
-frame's duration: motion that is smooth has little of it, motion that trembles a lot. Times are of the processor, start
-and settling included, since the clock on the wall depends on who else is there.
+frame's duration, which is small for smooth motion and large for motion that trembles. Times are processor times and
+include start and settling; clock times would depend on other processes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from warpgarment.view import draw
 from warpgarment.view.markdown import table
 
 RESULTS = Path(__file__).parent / "results"
-WIDER = 0.020  # gap between the T-shirt and the one over it [m]
+WIDER = 0.020  # gap between the T-shirt and the wider one over it [m]
 NOTE = """Newton's strip is soft because five iterations do not converge. Measured apart, Blender 4.5: strips cut from
 irregular meshes stretch 1.1 to 2.3 times as far as they should (0.93 to 1.03 times with `compression` 1), more than
 this one; on the coarser meshes that the checks take by default, the period is 4.1 % off, since all vertices weigh the
@@ -56,23 +56,23 @@ NAMES = {
 
 
 def cloth(garment: Garment, start: np.ndarray) -> Cloth:
-    """A garment of the default material."""
+    """A garment of the default material, with its start positions [m], [V, 3]."""
     edges = garment.vertices[garment.edges]
     return Cloth(garment, float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).mean()), start.astype(np.float32))
 
 
 def wider(garment: Garment) -> Garment:
-    """The garment moved outwards along its normals: a layer over it."""
+    """The garment moved outwards along its normals, which is a layer over it."""
     rest = garment.vertices.astype(np.float64)
     rest += WIDER * igl.per_vertex_normals(rest, garment.faces.astype(np.int64))
     return Garment(rest.astype(np.float32), garment.faces, pins=garment.pins, name=f"wider {garment.name}")
 
 
 def scenes(frames: int) -> dict[str, ClothScene]:
-    """What is simulated."""
+    """The scenes by name."""
     bundle = demo.assets()
     with np.load(demo.ASSETS / "body.npz", allow_pickle=False) as data:
-        first = data["bone_transforms"][0, 0].astype(np.float64)  # carries the rest pose to where the walk begins
+        first = data["bone_transforms"][0, 0].astype(np.float64)  # moves the rest pose to the start of the walk
 
     def worn(*garments: Garment) -> ClothScene:
         cloths = tuple(cloth(g, g.vertices @ first[:, :3].T + first[:, 3]) for g in garments)
@@ -83,7 +83,7 @@ def scenes(frames: int) -> dict[str, ClothScene]:
 
 
 def simulated(teacher: Teacher, scene: ClothScene) -> tuple[np.ndarray, float]:
-    """Frames, float32 [T, V, 3], and seconds of the processor for each, in this process and its children."""
+    """Frames [m], float32 [T, V, 3], and processor time per frame of this process and its children [s]."""
 
     def spent() -> float:
         times = os.times()
@@ -98,7 +98,7 @@ def simulated(teacher: Teacher, scene: ClothScene) -> tuple[np.ndarray, float]:
 
 
 def figures(scene: ClothScene, frames: np.ndarray) -> dict[str, float]:
-    """What is measured of simulated frames, float32 [T, V, 3]."""
+    """Figures of simulated frames [m], float32 [T, V, 3], by name."""
     points, body, faces = frames.astype(np.float64), scene.body_frames, scene.body_faces.astype(np.int64)
     strains = []
     for item, begin, end in zip(scene.cloths, scene.starts, scene.starts[1:], strict=False):
@@ -110,7 +110,7 @@ def figures(scene: ClothScene, frames: np.ndarray) -> dict[str, float]:
         igl.signed_distance(p, b.astype(np.float64), faces, sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER)[0]
         for p, b in zip(points, body, strict=True)
     ]
-    found = {
+    values = {
         "stretch_mean": 100 * strain.mean(),
         "stretch_p99": 100 * np.quantile(strain, 0.99),
         "stretch_max": 100 * strain.max(),
@@ -121,17 +121,17 @@ def figures(scene: ClothScene, frames: np.ndarray) -> dict[str, float]:
     }
     if len(scene.cloths) > 1:
         inner, end = scene.cloths[0].garment, int(scene.starts[1])
-        found["inside_inner"] = 100 * layer_collision(frames[:, end:], frames[:, :end], inner.faces)
-    return {name: float(value) for name, value in found.items()}
+        values["inside_inner"] = 100 * layer_collision(frames[:, end:], frames[:, :end], inner.faces)
+    return {name: float(value) for name, value in values.items()}
 
 
-def picture(path: Path, shown: dict[str, dict[str, np.ndarray]], found: dict[str, ClothScene]) -> None:
-    """Rows of moments: each scene by each teacher, one below the other."""
-    frames = len(next(iter(found.values())))
+def picture(path: Path, shown: dict[str, dict[str, np.ndarray]], drawn: dict[str, ClothScene]) -> None:
+    """Draws rows of frames: each scene by each teacher, one below the other."""
+    frames = len(next(iter(drawn.values())))
     whole = demo.assets().body
     body = BodyMotion(whole.vertices[:frames], whole.faces, whole.fps)
     rows: list[draw.Row] = []
-    for name, scene in found.items():
+    for name, scene in drawn.items():
         parts = list(zip(scene.cloths, scene.starts, scene.starts[1:], strict=False))
         for teacher, by_name in shown.items():
             tints = [draw.SLATE, draw.OCHRE] if teacher == "newton" else [draw.CORAL, draw.TEAL]
@@ -141,7 +141,7 @@ def picture(path: Path, shown: dict[str, dict[str, np.ndarray]], found: dict[str
 
 
 def markdown(about: dict[str, str], rows: list[dict], checks: list[dict], frames: int) -> str:
-    """The results as tables."""
+    """The results as tables in Markdown."""
     lines = ["# Physics teachers side by side", "", ", ".join(f"{k} {v}" for k, v in about.items()), ""]
     lines += [f"`python -m benchmarks.teachers_side_by_side --frames {frames}`, default settings and material.", ""]
     cells = [
@@ -159,19 +159,19 @@ def markdown(about: dict[str, str], rows: list[dict], checks: list[dict], frames
 
 
 def main() -> None:
-    """Simulates, measures, draws, writes."""
+    """Simulates, measures, draws and writes the results."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--teachers", nargs="+", choices=TEACHERS, default=list(TEACHERS))
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    found = scenes(options.frames)
+    made = scenes(options.frames)
     shown: dict[str, dict[str, np.ndarray]] = {}
     rows, checks, settings = [], [], {}
     for name in options.teachers:
         teacher = make_teacher(name, device="cpu")
         settings[name], shown[name] = teacher.settings(), {}
-        for scene_name, scene in found.items():
+        for scene_name, scene in made.items():
             shown[name][scene_name], seconds = simulated(teacher, scene)
             row = {"scene": scene_name, "teacher": name, "seconds": seconds}
             rows.append(row | figures(scene, shown[name][scene_name]))
@@ -184,12 +184,12 @@ def main() -> None:
             answer = {"measured": check.measured, "expected": check.expected, "unit": check.unit, "error": check.error}
             checks.append({"check": check.name, "teacher": name} | answer)
             print(name, check, flush=True)
-    rows.sort(key=lambda row: list(found).index(row["scene"]))
+    rows.sort(key=lambda row: list(made).index(row["scene"]))
     checks.sort(key=lambda row: row["check"])
-    versions = {p: told[p] for told in settings.values() for p in ("newton", "bpy") if p in told}
+    versions = {p: used[p] for used in settings.values() for p in ("newton", "bpy") if p in used}
     about = {"date": time.strftime("%Y-%m-%d"), **machine(torch.device("cpu")), **versions}
     options.out.mkdir(parents=True, exist_ok=True)
-    picture(options.out / "teachers.png", shown, found)
+    picture(options.out / "teachers.png", shown, made)
     everything = {"machine": about, "frames": options.frames, "settings": settings, "rows": rows, "checks": checks}
     (options.out / "teachers.json").write_text(json.dumps(everything, indent=1))
     (options.out / "teachers.md").write_text(markdown(about, rows, checks, options.frames))

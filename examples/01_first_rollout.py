@@ -1,4 +1,4 @@
-"""A bundled dress on a bundled walking body: rolled out, compared with physics, saved as USD and as a picture.
+"""A bundled dress on a bundled walking body is rolled out, compared with physics, and saved as USD and as a picture.
 
 python examples/01_first_rollout.py
 """
@@ -12,7 +12,7 @@ import warpgarment as wg
 
 def main(out: Path = Path("out/first_rollout"), frames: int = 90) -> None:
     assets = wg.demo.assets()
-    dress = assets.garments["dress"]  # a garment at rest, and what physics says about it
+    dress = assets.garments["dress"]  # a garment at rest, and its motion by a physics simulation
     simulator = wg.Simulator.from_pretrained("default")
 
     # `collider` is the body without hands; the first frame is the dress as it hangs on the body

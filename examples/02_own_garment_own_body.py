@@ -1,4 +1,4 @@
-"""Your garment on your body: a mesh from a file, any deforming triangle mesh as body, and `fit` in between.
+"""Your garment on your body: a garment from a file, any deforming triangle mesh as the body, and `fit` between them.
 
 The body need not be a person, let alone a parametric one. Here it is a bottle that bows and turns, and the garment is a
 sleeve for it, modelled in centimetres around the upright bottle.
@@ -15,7 +15,16 @@ import warpgarment as wg
 
 
 def lathe(heights: np.ndarray, radii: np.ndarray, around: int) -> tuple[np.ndarray, np.ndarray]:
-    """A surface of revolution about Y from bottom to top, faces counter-clockwise seen from outside."""
+    """A surface of revolution about Y from bottom to top, with faces counter-clockwise seen from outside.
+
+    Args:
+        heights: Heights of the rings [m], shape [R].
+        radii: Radii of the rings [m], shape [R].
+        around: Number of vertices in a ring.
+
+    Returns:
+        Vertices [m], shape [V, 3], and faces, shape [F, 3].
+    """
     angle = 2 * np.pi * np.arange(around) / around
     x, z = radii[:, None] * np.sin(angle), radii[:, None] * np.cos(angle)
     y = np.broadcast_to(heights[:, None], x.shape)
@@ -26,10 +35,10 @@ def lathe(heights: np.ndarray, radii: np.ndarray, around: int) -> tuple[np.ndarr
 
 
 def bottle_motion(frames: int) -> tuple[np.ndarray, wg.BodyMotion]:
-    """A bottle upright (the rest pose), and the motion: already bent in its first frame."""
+    """An upright bottle (the rest pose), and its motion, which is already bent in its first frame."""
     heights = np.linspace(0, 1.2, 49)
     radii = 0.10 + 0.10 * np.exp(-(((heights - 0.45) / 0.28) ** 2))
-    radii[[0, -1]] = 1e-3  # closed, but for a pinhole
+    radii[[0, -1]] = 1e-3  # closed except for a pinhole
     rest, faces = lathe(heights, radii, 40)
     posed = []
     for t in range(frames):
@@ -44,14 +53,14 @@ def bottle_motion(frames: int) -> tuple[np.ndarray, wg.BodyMotion]:
 def main(out: Path = Path("out/own_garment"), frames: int = 60) -> None:
     out.mkdir(parents=True, exist_ok=True)
     rest, motion = bottle_motion(frames)
-    motion.save(out / "bottle.pc2")  # with bottle.obj beside it: what Blender and Houdini write
+    motion.save(out / "bottle.pc2")  # with bottle.obj beside it, as Blender and Houdini write it
 
     heights = np.linspace(25, 75, 15)  # centimetres
     sleeve, faces = lathe(heights, 12.0 + 10.0 * np.exp(-(((heights - 45) / 28) ** 2)), 30)
     lines = [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in sleeve] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
     (out / "sleeve.obj").write_text("\n".join(lines) + "\n")
 
-    # from here on it is your files
+    # From here on, the files could be your own.
     garment = wg.Garment.load(out / "sleeve.obj", unit="cm")
     body = wg.BodyMotion.load(out / "bottle.pc2", fps=30.0)
     first = wg.fit(garment, (rest, body.faces), body.vertices[0])

@@ -1,4 +1,4 @@
-"""Several garments on several bodies in one batch: the same motions as one by one, in fewer launches.
+"""Several garments on several bodies in one batch, with the motions of single rollouts but fewer launches.
 
 python examples/03_batch.py
 """
@@ -20,7 +20,7 @@ def main(out: Path = Path("out/batch"), frames: int = 60) -> None:
     slow = wg.BodyMotion(walk.vertices, walk.faces, fps=20.0)  # resampled to the network's rate
 
     garments = [dress.garment, tshirt.garment, dress.garment, tshirt.garment]
-    bodies = [walk, walk, turned, slow]  # one per garment; may repeat
+    bodies = [walk, walk, turned, slow]  # one per garment; a body may occur several times
     first = [dress.first_vertices, tshirt.first_vertices, dress.first_vertices * [-1, 1, -1], tshirt.first_vertices]
 
     simulator = wg.Simulator.from_pretrained("default")

@@ -1,4 +1,4 @@
-"""A body that arrives live: each frame is simulated when the body's next pose is known, not before.
+"""A live body: each frame is simulated as soon as the body's next pose is known.
 
 python examples/04_live_body.py
 """
@@ -14,7 +14,7 @@ import warpgarment as wg
 
 
 def tracked_body(motion: wg.BodyMotion, frames: int) -> Iterator[np.ndarray]:
-    """Stands for a camera, a game or a simulation that hands over vertices [U, 3] 30 times a second."""
+    """A stand-in for a camera, a game or a simulation that yields vertices [m], [U, 3], 30 times per second."""
     yield from motion.vertices[1:frames]
 
 
@@ -28,7 +28,7 @@ def main(out: Path = Path("out/live"), frames: int = 60) -> None:
     for next_body in tracked_body(body, frames):
         began = time.perf_counter()
         state = simulator.step(state, next_body)
-        shown.append(state.vertices)  # draw it, send it, ...
+        shown.append(state.vertices)  # here you would draw or send them
         latency.append(time.perf_counter() - began)
         if not state.status.finite:
             print(state.status.message)

@@ -1,7 +1,7 @@
 """Training on your own simulations: write them as sequences, train, roll the new network out.
 
-Here a single bundled simulation stands for yours, and a minute of training for hours: watch the loss fall, but expect
-no good network. `warpgarment train --data DIR --out DIR` does the same from the command line.
+Here a single bundled simulation takes the place of yours, and a minute of training that of hours: the loss falls, but
+do not expect a good network. `warpgarment train --data DIR --out DIR` trains from the command line.
 
 python examples/05_train_on_own_data.py
 """
@@ -19,14 +19,14 @@ from warpgarment.training.train.start import train
 
 
 def write_own_data(folder: Path, frames: int) -> None:
-    """One folder per sequence: a garment's rest mesh and motion, a body's rest mesh, bones and their transforms."""
+    """Writes one folder per sequence: a garment's rest mesh and motion, a body's rest mesh, bones and transforms."""
     dress = wg.demo.assets().garments["dress"]
     with np.load(wg.demo.ASSETS / "body.npz") as body:
         arrays = {
             "garment_rest_vertices": dress.garment.vertices,
             "garment_faces": dress.garment.faces,
             "pins": dress.garment.pins,
-            "garment_vertices": dress.truth.vertices[:frames],  # your simulator's result, metres, Y up
+            "garment_vertices": dress.truth.vertices[:frames],  # the result of your simulator [m], Y up
             "body_rest_vertices": body["rest_vertices"],
             "body_faces": body["faces"],
             "collider_faces": body["collider_faces"],

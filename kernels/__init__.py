@@ -1,4 +1,4 @@
-"""Numerics on arrays, in Warp kernels. Modules are imported when first used: `warpgarment.kernels.sdf`."""
+"""Numerics on arrays, in Warp kernels. A module such as `warpgarment.kernels.sdf` is imported when it is first used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every operator needs to pass torch tensors to Warp: checks, zero-copy views and the stream."""
+"""Passing torch tensors to Warp, as every operator does: checks, zero-copy views and the stream."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import warp as wp
 if wp.config.log_level == wp.LOG_INFO:  # the user's own setting stays; Warp's default prints at every module load
     wp.config.log_level = wp.LOG_WARNING
 
-MOST_DESCRIPTORS = 16_384  # a few MB; a frame has some hundred, a training many that never come again
+MOST_DESCRIPTORS = 16_384  # a few MB; a frame has some hundred, training has many that never recur
 _descriptors: dict[tuple[object, ...], Any] = {}
 
 _DTYPES = {torch.float32: "float32", torch.int32: "int32"}
@@ -28,15 +28,15 @@ def expect(
     """Refuses a tensor that a kernel could not read.
 
     Args:
-        name: What the caller calls it.
-        tensor: The argument.
+        name: Name of the argument, for error messages.
+        tensor: The argument to check.
         shape: Expected shape; None stands for any length.
-        dtype: Expected type.
-        device: Expected device, where another argument has set it.
+        dtype: Expected dtype.
+        device: Expected device; None accepts any device.
 
     Raises:
-        TypeError: Not a tensor, or of another dtype.
-        ValueError: Another shape or device.
+        TypeError: The argument is not a tensor or has another dtype.
+        ValueError: The tensor has another shape or is on another device.
     """
     if not isinstance(tensor, torch.Tensor):
         raise TypeError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
@@ -52,41 +52,43 @@ def expect(
 
 
 def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
-    """A Warp array over the tensor's memory; no copy where the tensor is contiguous, and no gradient buffer."""
+    """A Warp array over the tensor's memory, without a gradient buffer; copies only a tensor that is not contiguous."""
     wp.init()
     return cast(wp.array, wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False))
 
 
 def as_argument(tensor: torch.Tensor, dtype: type) -> object:
-    """A tensor as an argument of a launch: a descriptor, which costs a tenth of an array.
+    """A tensor as an argument of a launch: a descriptor, which costs a tenth of what a Warp array costs.
 
-    It keeps no memory alive, so the tensor must outlive the launch; a copy that had to be made is kept by its array.
+    The descriptor keeps no memory alive, so the tensor must outlive the launch. A tensor that is not contiguous is
+    copied into a Warp array, which keeps the copy alive.
     """
     if tensor.numel() == 0:
-        tensor = tensor.new_empty(tensor.shape)  # slices of nothing have strides that Warp refuses
+        tensor = tensor.new_empty(tensor.shape)  # empty slices have strides that Warp refuses
     elif not tensor.is_contiguous():
         return as_warp(tensor, dtype)
     return descriptor(tensor, dtype)
 
 
 def descriptor(tensor: torch.Tensor, dtype: type) -> object:
-    """Address and shape of a tensor as Warp passes them; remembered, as most come again in every frame."""
+    """Address and shape of a tensor as Warp passes them; cached, since most of them recur in every frame."""
     key = (tensor.data_ptr(), tensor.shape, tensor.stride(), tensor.dtype, dtype)
-    found = _descriptors.get(key)
-    if found is None:
+    cached = _descriptors.get(key)
+    if cached is None:
         if len(_descriptors) >= MOST_DESCRIPTORS:
             _descriptors.clear()
-        found = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-        found._ref = None  # or the memory would be kept as long as this
-        _descriptors[key] = found
-    return found
+        cached = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+        cached._ref = None  # otherwise the memory would be kept as long as the descriptor
+        _descriptors[key] = cached
+    return cached
 
 
 @contextlib.contextmanager
 def torch_stream(device: torch.device) -> Iterator[wp.Device]:
-    """Launches inside run on torch's current stream of the device. Yields the Warp device.
+    """Context in which Warp launches run on torch's current stream of the device; yields the Warp device.
 
-    Nothing is ever put on Warp's own stream, so there is nothing on it to wait for, which a graph capture would refuse.
+    Nothing is ever put on Warp's own stream, so the two streams need not be synchronised; a graph capture would refuse
+    such a wait.
     """
     wp.init()  # at first use and not at import, so that importing never touches a driver
     warp_device = wp.device_from_torch(device)

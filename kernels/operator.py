@@ -20,7 +20,7 @@ Outputs = dict[str, tuple[type, tuple[int, ...]]]  # name -> (Warp element type,
 
 
 def allocate(shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    """Memory for an output. The kernel writes all of it: tests replace this function by one that fills in NaN."""
+    """Uninitialised memory for an output, which the kernel writes completely; tests fill it with NaN instead."""
     return torch.empty(tuple(shape), dtype=dtype, device=device)
 
 
@@ -31,7 +31,7 @@ def launch(
     outputs: Sequence[tuple[torch.Tensor, type]],
     device: torch.device,
 ) -> None:
-    """Runs a kernel forward over `rows` threads on torch's stream. No rows, no launch."""
+    """Runs a kernel forward over `rows` threads on torch's stream; does nothing if there are no rows."""
     if rows == 0:
         return
     with torch_stream(device) as warp_device:
@@ -56,15 +56,16 @@ def row_operator(
     """Registers `warpgarment::name`, an operator that runs `kernel` once per row.
 
     Args:
-        name: Operator name; the backward is called `name_backward`.
-        kernel: Takes the inputs, then the outputs; thread i writes row i of every output.
+        name: Operator name; the backward operator is called `name_backward`.
+        kernel: Kernel that takes the inputs, then the outputs; thread i writes row i of every output.
         inputs: Name and Warp element type of each tensor, in the kernel's order.
         outputs: Name, Warp element type and row shape of each result, in the kernel's order.
-        rows: The input whose length is the number of rows.
-        gradients: The inputs that gradients flow to.
+        rows: Name of the input whose length is the number of rows.
+        gradients: Names of the inputs that gradients flow to.
 
     Returns:
-        The operator: tensors in, in the order of `inputs`; one tensor, or a tuple of them, out. It checks nothing.
+        The operator. It takes tensors in the order of `inputs` and returns one tensor, or a tuple of several. It does
+        not check its arguments.
     """
     names, types = list(inputs), list(inputs.values())
     kinds = [kind for kind, _ in outputs.values()]
@@ -82,9 +83,9 @@ def row_operator(
 
     def forward(*tensors: torch.Tensor) -> Any:
         results = empty_outputs(tensors, allocate)
-        arguments, found = zip(tensors, types, strict=True), zip(results, kinds, strict=True)
+        arguments, typed_results = zip(tensors, types, strict=True), zip(results, kinds, strict=True)
         at = tensors[row_index]
-        launch(kernel, at.shape[0], list(arguments), list(found), at.device)
+        launch(kernel, at.shape[0], list(arguments), list(typed_results), at.device)
         return unpacked(results)
 
     def fake(*tensors: torch.Tensor) -> Any:
@@ -99,15 +100,15 @@ def row_operator(
 
     def backward(*tensors: torch.Tensor) -> Any:
         arguments, incoming = tensors[: len(names)], tensors[len(names) :]
-        found = [torch.zeros(arguments[i].shape, dtype=torch.float32, device=arguments[i].device) for i in wanted]
+        results = [torch.zeros(arguments[i].shape, dtype=torch.float32, device=arguments[i].device) for i in wanted]
         at = arguments[row_index]
         if at.shape[0] == 0:
-            return unpacked(found)
+            return unpacked(results)
         adjoints: list[wp.array | None] = [None] * len(names)
-        for i, gradient in zip(wanted, found, strict=True):
+        for i, gradient in zip(wanted, results, strict=True):
             adjoints[i] = as_warp(gradient, types[i])
-        # The adjoint writes into the incoming gradients, which autograd may still hold: it gets a copy. It replays the
-        # forward pass too, into memory of its own.
+        # The adjoint writes into the incoming gradients, which autograd may still hold, so it is given copies. It also
+        # runs the forward pass again, whose results go to scratch memory.
         copies = [torch.clone(g, memory_format=torch.contiguous_format) for g in incoming]
         scratch = empty_outputs(arguments, torch.empty)
         with torch_stream(at.device) as warp_device:
@@ -121,7 +122,7 @@ def row_operator(
                 adjoint=True,
                 device=warp_device,
             )
-        return unpacked(found)
+        return unpacked(results)
 
     def fake_backward(*tensors: torch.Tensor) -> Any:
         return unpacked([torch.empty(tensors[i].shape, device=tensors[i].device) for i in wanted])
@@ -139,40 +140,40 @@ def row_operator(
 
     def pull_back(ctx: Any, *incoming: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         results = backward_operator(*ctx.saved_tensors, *incoming)
-        found: list[torch.Tensor | None] = [None] * len(names)
+        gradients_of_inputs: list[torch.Tensor | None] = [None] * len(names)
         for i, gradient in zip(wanted, results if len(wanted) > 1 else [results], strict=True):
-            found[i] = gradient if ctx.needs_input_grad[i] else None
-        return tuple(found)
+            gradients_of_inputs[i] = gradient if ctx.needs_input_grad[i] else None
+        return tuple(gradients_of_inputs)
 
     operator.register_autograd(pull_back, setup_context=save)
     return operator
 
 
 def pack(model: tuple[Any, ...]) -> list[torch.Tensor]:
-    """A named tuple as the one list of tensors that an operator takes.
+    """Flattens a named tuple into the one list of tensors that an operator takes.
 
     Args:
-        model: Its fields are tensors, numbers, which travel as tensors of no dimension on the host, and other such
-            tuples, whose fields take their place.
+        model: Named tuple whose fields are tensors, numbers or other such tuples. A number becomes a tensor of no
+            dimension on the host; a tuple is replaced by its own fields.
     """
-    found: list[torch.Tensor] = []
+    tensors: list[torch.Tensor] = []
     for value in model:
         if isinstance(value, torch.Tensor):
-            found.append(value)
+            tensors.append(value)
         else:
-            found += pack(value) if isinstance(value, tuple) else [torch.tensor(value)]
-    return found
+            tensors += pack(value) if isinstance(value, tuple) else [torch.tensor(value)]
+    return tensors
 
 
 def unpack(packed: Sequence[torch.Tensor], kind: type[_Model]) -> _Model:
-    """What `pack` was given: a named tuple of this kind. Reads nothing from a device.
+    """The inverse of `pack`: a named tuple from its list of tensors. Reads nothing from a device.
 
     Args:
-        packed: The list.
-        kind: Class of the tuple; its types say which fields are numbers.
+        packed: List of tensors that `pack` returned.
+        kind: Class of the named tuple; its annotations decide which fields are numbers.
 
     Raises:
-        ValueError: The list has another length.
+        ValueError: The list is too short or too long for the class.
     """
     values = iter(packed)
     try:

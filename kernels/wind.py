@@ -11,14 +11,14 @@ Fields in Cloth Animations"; lift taken along the component of the normal across
     | -------- | ----------------------------- | --------------------------------------------------------------- |
     | u        | air                           | velocity of the air [m/s], one per world                        |
     | v        | velocities                    | velocities of the vertices [m/s]                                |
-    | ρ        | density                       | of the air [kg/m^3]                                             |
-    | A, n     | area, normal                  | of the face as it is now [m^2], unit                            |
-    | C_D, C_L | drag, lift                    | coefficients; 1.2 is a plate met head-on                        |
-    | f        | force                         | [N]                                                             |
+    | ρ        | density                       | density of the air [kg/m^3]                                     |
+    | A, n     | area, normal                  | current area of the face [m^2], its unit normal                 |
+    | C_D, C_L | drag, lift                    | coefficients; C_D is 1.2 for a plate met head-on                |
+    | f        | force                         | force on the face [N]                                           |
 
-Head-on, f = ½ ρ C_D A |w|² ŵ; along the face, and where nothing moves against the air, f = 0; the side of a face does
-not matter. Neither coefficient depends on the angle beyond this, faces do not shelter each other, and the air is not
-moved by the cloth.
+For wind head-on, f = ½ ρ C_D A |w|² ŵ. For wind along the face, and for a face at rest relative to the air, f = 0.
+Front and back of a face count alike. The coefficients do not depend on the angle in any other way, faces do not shelter
+each other, and the cloth does not move the air.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from .launch import as_warp, expect, torch_stream
 from .operator import allocate
 
 AIR_DENSITY = 1.225
-"""Of air at sea level and 15 °C [kg/m^3]."""
+"""Density of air at sea level and 15 °C [kg/m^3]."""
 DRAG, LIFT = 1.2, 0.6
-"""Coefficients used unless others are given."""
+"""Default coefficients of drag and lift, without unit."""
 
 SLOWEST = wp.constant(1.0e-6)  # m/s; a slower wind has no direction
 SMALLEST = wp.constant(1.0e-12)  # m^2; a smaller face has no normal
@@ -40,7 +40,7 @@ SMALLEST = wp.constant(1.0e-12)  # m^2; a smaller face has no normal
 
 @wp.func
 def plate_force(cross: wp.vec3, wind: wp.vec3, density: float, drag: float, lift: float):
-    """Force on a face; `cross` is the product of two of its edges."""
+    """Force on a face [N]; `cross` is the cross product of two of its edges [m^2]."""
     area = 0.5 * wp.length(cross)
     speed = wp.length(wind)
     if speed < SLOWEST or area < SMALLEST:
@@ -92,17 +92,17 @@ def add_air_forces(
     lift: float = LIFT,
     density: float = AIR_DENSITY,
 ) -> None:
-    """Adds the force of the air to what a simulation holds in Warp arrays; nothing is checked and nothing copied.
+    """Adds the force of the air to the forces that a simulation holds in a Warp array; checks and copies nothing.
 
     Args:
         faces: Vertex indices, int32 [F, 3].
-        vertices: Positions [m], vec3 [V].
-        velocities: [m/s], vec3 [V].
-        world: World of each vertex, int32 [V]; that of a face's first vertex decides.
+        vertices: Vertex positions [m], vec3 [V].
+        velocities: Vertex velocities [m/s], vec3 [V].
+        world: World of each vertex, int32 [V]; a face is in the world of its first vertex.
         air: Velocity of the air in each world [m/s], vec3 [W].
-        force: What is added to [N], vec3 [V].
-        drag, lift: Coefficients.
-        density: Of the air [kg/m^3].
+        force: Forces on the vertices, to which those of the air are added [N], vec3 [V].
+        drag, lift: Coefficients of drag and lift, without unit.
+        density: Density of the air [kg/m^3].
     """
     if not faces.shape[0]:
         return
@@ -123,24 +123,24 @@ def air_forces(
 ) -> torch.Tensor:
     """Force of the air on every vertex of a packed batch of garments; without gradients.
 
-    On a CPU the sum over a vertex's faces has one order, and the same input gives the same bits; a GPU sums in any
-    order. The checks of indices wait for a GPU.
+    On a CPU the forces at a vertex are summed in a fixed order, so that equal inputs give equal bits; on a GPU the
+    order varies. The checks of indices wait for a GPU.
 
     Args:
-        vertices: Positions [m], float32 [V, 3].
-        velocities: [m/s], float32 [V, 3].
+        vertices: Vertex positions [m], float32 [V, 3].
+        velocities: Vertex velocities [m/s], float32 [V, 3].
         faces: Packed vertex indices, int32 [F, 3].
         air: Velocity of the air in each world [m/s], float32 [W, 3].
-        world: World of each vertex, int32 [V]; None: all are in the only one.
-        drag, lift: Coefficients.
-        density: Of the air [kg/m^3].
+        world: World of each vertex, int32 [V]; None if there is one world only.
+        drag, lift: Coefficients of drag and lift, without unit.
+        density: Density of the air [kg/m^3].
 
     Returns:
-        float32 [V, 3] [N].
+        Force on each vertex [N], float32 [V, 3].
 
     Raises:
-        TypeError: Another dtype.
-        ValueError: Another shape or device, a face or vertex that names what is not there.
+        TypeError: An argument has another dtype.
+        ValueError: An argument has another shape or device, or an index of a vertex or world is out of range.
     """
     device = vertices.device if isinstance(vertices, torch.Tensor) else None
     expect("vertices", vertices, (None, 3))

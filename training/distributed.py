@@ -1,14 +1,14 @@
 r"""Several processes that train one network, started by torchrun, on one machine or many.
 
-Each process has a device of its own, takes its share of every batch, and holds the same weights. What they have to
-agree on goes through a `Group`. One process alone is a group of one, whose calls cost nothing.
+Each process has a device of its own, takes its share of every batch, and holds the same weights. They exchange numbers
+through a `Group`. A single process is a group of one, whose calls cost nothing.
 
     export TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1        # else torchrun's restarts meet old addresses (torch 2.13)
     torchrun --standalone --nproc-per-node 8 --max-restarts 3 -m warpgarment train --data DATA --out OUT \
         --steps 200000 --resume
 
-Small decisions (how late it is) travel between the processors by gloo, so that no process waits for its GPU to learn
-of them; gradients travel between GPUs by NCCL.
+Small numbers, such as the elapsed time, are exchanged between CPUs by gloo, so that no process waits for its GPU;
+gradients are exchanged between GPUs by NCCL.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from types import TracebackType
 import torch
 import torch.distributed as dist
 
-PATIENCE = timedelta(hours=2)  # others wait while the first process validates
+PATIENCE = timedelta(hours=2)  # limit of a wait; the other processes wait while the first one validates
 FRESH = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
 
 
 class GroupError(RuntimeError):
-    """The processes of a run cannot work together; the message says why."""
+    """The processes of a run cannot work together; the message names the reason."""
 
 
 class Group:
     """The processes of a run.
 
     Args:
-        device: "cpu", "cuda" or "cuda:1"; None: a GPU where there is one. Of several processes on a machine with GPUs,
-            each takes the one with its own local number.
+        device: "cpu", "cuda" or "cuda:1"; None takes a GPU if there is one. If there are several processes on a machine
+            with GPUs, each takes the GPU with its own local number.
 
     Attributes:
-        rank, size: This process's number, and how many there are. Number 0 writes files, logs and validates.
-        device: Where it trains.
+        rank: Number of this process. Number 0 writes files, logs and validates.
+        size: Number of processes.
+        device: Device on which this process trains.
 
     Raises:
-        GroupError: More processes than GPUs, or a device that all would share.
+        GroupError: There are more processes than GPUs, or all processes would share a device.
     """
 
     def __init__(self, device: str | None = None) -> None:
@@ -79,7 +80,7 @@ class Group:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leaves the group; after an error it is left as it is, since others may still wait in it for ever."""
+        """Closes the group, except after an error, since other processes may still wait in it."""
         if self.size > 1 and kind is None:
             dist.barrier()
             dist.destroy_process_group()
@@ -90,10 +91,13 @@ class Group:
         return self.rank == 0
 
     def part(self, batch_size: int) -> slice:
-        """Which samples of a batch are this process's.
+        """The range of samples of a batch that this process takes.
+
+        Args:
+            batch_size: Number of samples in the batch.
 
         Raises:
-            GroupError: They cannot be shared evenly.
+            GroupError: The samples cannot be shared evenly.
         """
         if batch_size % self.size:
             raise GroupError(
@@ -104,39 +108,44 @@ class Group:
         return slice(self.rank * count, (self.rank + 1) * count)
 
     def broadcast(self, tensor: torch.Tensor, source: int = 0) -> torch.Tensor:
-        """The tensor of one process, in place in all."""
+        """Copies the tensor of one process, number `source`, into that of every process; returns the tensor."""
         if self.size > 1:
             dist.broadcast(tensor, source)
         return tensor
 
     def same(self, tensors: Iterable[torch.Tensor]) -> None:
-        """Replaces tensors by those of the first process."""
+        """Replaces tensors, in place, by those of the first process."""
         for tensor in tensors:
             self.broadcast(tensor.detach())
 
     def mean(self, tensor: torch.Tensor) -> torch.Tensor:
-        """Mean over the processes; the tensor itself is used up."""
+        """Mean over the processes; the tensor is overwritten with it."""
         if self.size > 1:
             dist.all_reduce(tensor)
             tensor /= self.size
         return tensor
 
-    def told(self, value: float) -> float:
-        """What the first process says, for all."""
+    def from_first(self, value: float) -> float:
+        """The value of the first process, in all processes."""
         return value if self.size == 1 else float(self.broadcast(torch.tensor([value], dtype=torch.float64)))
 
     def agree(self, what: str, value: int, remedy: str) -> None:
-        """Makes sure that a number is the same in all processes.
+        """Checks that a number is the same in all processes.
+
+        Args:
+            what: Name of the number, for the error message.
+            value: The number in this process.
+            remedy: Sentence that names the remedy.
 
         Raises:
-            GroupError: It is not; raised in all of them.
+            GroupError: The number differs; raised in all processes.
         """
         if self.size == 1:
             return
-        mine = torch.tensor([value], dtype=torch.int64)
-        found = [torch.empty_like(mine) for _ in range(self.size)]
-        dist.all_gather(found, mine)
-        values = [int(v) for v in found]
+        own = torch.tensor([value], dtype=torch.int64)
+        gathered = [torch.empty_like(own) for _ in range(self.size)]
+        dist.all_gather(gathered, own)
+        values = [int(v) for v in gathered]
         if len(set(values)) > 1:
             other = next(r for r, v in enumerate(values) if v != values[0])
             raise GroupError(
@@ -144,6 +153,6 @@ class Group:
             )
 
     def wait(self) -> None:
-        """Waits until all processes are here."""
+        """Waits until all processes have called this."""
         if self.size > 1:
             dist.barrier()

@@ -1,4 +1,4 @@
-"""What cloth is made of, in SI units, and how it is drawn at random.
+"""Material of cloth in SI units, its counterparts in Newton and Blender, and random materials.
 
 | field     | Newton's VBD                                                         | Blender's cloth                  |
 | --------- | -------------------------------------------------------------------- | -------------------------------- |
@@ -15,21 +15,22 @@ on equilateral triangles of edge e, bend makes a plate of stiffness √3/2 · be
 
 **D-LAYERS** (Towards Multi-Layered 3D Garments Animation, supplement B.2) draws Blender's numbers uniformly: mass of a
 vertex 0.2 to 0.8, tension, compression, shear and bending stiffness 15 to 100, friction 40 to 80, on garments ten times
-life size. :func:`from_blender` says what they come to. The scaling is chosen, the rest derived from Blender's equations
-and checked against it:
+life size. :func:`from_blender` converts them to SI units. The scaling is chosen; the rest is derived from Blender's
+equations and checked against Blender:
 
-- *Scale.* Length shrinks by `scale`, a mass of one in Blender is a gram, gravity stays: the cloth sags and stretches
-  under its own weight by the same share of its length, on a clock √scale times as fast. At scale 10 its weight per
-  volume stays too. (Readers of recordings keep the clock and not the weight, see `readers.blender_cloth`.)
-- *Mass* is per vertex, so density is mass times vertices over area, and the same numbers mean another cloth on another
-  mesh: numbers belong to a mesh of so many vertices on so large an area.
+- *Scale.* Length shrinks by `scale`, a mass of one in Blender is a gram, gravity does not change: the cloth sags and
+  stretches under its own weight by the same share of its length, on a clock √scale times as fast. At scale 10 its
+  weight per volume does not change either. (Readers of recordings keep the clock and not the weight; see
+  `readers.blender_cloth`.)
+- *Mass* is per vertex, so density is mass times the number of vertices over the area, and the same numbers describe
+  another cloth on another mesh: they are meaningful only with the mesh's number of vertices and its area.
 - *Tension.* Edges are springs of stiffness tension / mean edge, in units of force that gravity fixes (0.00981 per frame
-  squared: 1000 N). A net of such springs K on equilateral triangles is a sheet with λ = μ = √3/4 K. Derived; strips
-  hung in Blender 4.5 stretch by what this says within 8 %.
-- *Shear.* Blender has shear springs across faces of four corners only: triangle strips hang alike at shear 5 and 50.
-  It is mapped as tension is, so that equal numbers give the isotropic net.
-- *Bending.* A hinge of length L between triangles of height h turns back with 0.1 bending L h / 3 per radian. Derived;
-  cantilevers bend by that within 12 %, as far as Blender brings them to rest.
+  squared: 1000 N). A net of such springs K on equilateral triangles is a sheet with λ = μ = √3/4 K. This is derived;
+  strips hung in Blender 4.5 stretch as predicted within 8 %.
+- *Shear.* Blender has shear springs only across faces of four corners: triangle strips hang alike at shear 5 and 50.
+  Shear is mapped as tension is, so that equal numbers give the isotropic net.
+- *Bending.* A hinge of length L between triangles of height h turns back with 0.1 bending L h / 3 per radian. This is
+  derived; cantilevers bend as predicted within 12 %, as far as Blender brings them to rest.
 - *Compression* has no counterpart; :func:`to_blender` makes it equal to tension.
 - *Friction* is a hundred times the coefficient.
 """
@@ -50,14 +51,14 @@ DLAYERS = {
     "bending": (15.0, 100.0),
     "friction": (40.0, 80.0),
 }
-"""Blender's numbers that D-LAYERS draws from."""
+"""Ranges of Blender's numbers from which D-LAYERS draws."""
 
 DLAYERS_SCALE = 10.0
-"""How many times life size its garments are."""
+"""Size of D-LAYERS' garments as a multiple of life size."""
 
 VERTICES_PER_AREA = 1000.0
-"""Of the mesh that its numbers are taken to belong to [1/m^2 at life size], edges of 34 mm: not published, but those of
-the garments made here."""
+"""Density of vertices [1/m^2 at life size] of the mesh to which D-LAYERS' numbers are taken to belong: edges of 34 mm.
+It is not published; this is the density of the garments made here."""
 
 
 def from_blender(
@@ -72,19 +73,19 @@ def from_blender(
     area: float,
     scale: float = DLAYERS_SCALE,
 ) -> Material:
-    """The cloth that Blender's numbers stand for on a mesh of equilateral triangles; see the top of this file.
+    """The cloth that Blender's numbers describe on a mesh of equilateral triangles; see the top of this file.
 
     Args:
-        mass: Of a vertex.
-        tension, shear, bending: Stiffnesses.
-        compression: Left out: Newton's sheet resists it as it does tension.
-        friction: 0 to 80.
-        vertices: Number of the mesh's vertices.
-        area: Of the mesh at life size [m^2].
-        scale: How many times life size Blender's scene is.
+        mass: Mass of a vertex in Blender's unit.
+        tension, shear, bending: Stiffnesses in Blender's units.
+        compression: Stiffness against compression, which is ignored: Newton's sheet resists it as it does tension.
+        friction: Friction in Blender's unit, 0 to 80.
+        vertices: Number of vertices of the mesh.
+        area: Area of the mesh at life size [m^2].
+        scale: Size of Blender's scene as a multiple of life size.
 
     Returns:
-        The material, at life size; Blender's damping is not mapped.
+        The material at life size in SI units; Blender's damping is not mapped.
     """
     del compression
     edge = _edge(vertices, area)
@@ -101,13 +102,13 @@ def to_blender(material: Material, *, vertices: int, area: float, scale: float =
     """Blender's numbers for a cloth on a mesh: the inverse of :func:`from_blender`.
 
     Args:
-        material: At life size.
-        vertices: Number of the mesh's vertices.
-        area: Of the mesh at life size [m^2].
-        scale: How many times life size Blender's scene is.
+        material: Material at life size.
+        vertices: Number of vertices of the mesh.
+        area: Area of the mesh at life size [m^2].
+        scale: Size of Blender's scene as a multiple of life size.
 
     Returns:
-        mass, tension, compression (equal to tension), shear, bending and friction.
+        mass, tension, compression (equal to tension), shear, bending and friction by name, in Blender's units.
     """
     edge = _edge(vertices, area)
     tension = material.stretch * edge * 4.0 / math.sqrt(3.0)
@@ -125,7 +126,7 @@ _BEND = 0.1 / 3.0 * math.sqrt(3.0) / 2.0  # Blender's 0.1 h / 3 over the edge, h
 
 
 def _edge(vertices: int, area: float) -> float:
-    """Edge of equilateral triangles, two to a vertex, that cover an area [m]."""
+    """Edge length of equilateral triangles, two per vertex, that cover an area [m]."""
     return math.sqrt(2.0 * area / (math.sqrt(3.0) * vertices))
 
 
@@ -140,8 +141,8 @@ def _ranges() -> dict[str, tuple[float, float]]:
 
 
 RANGES = _ranges()
-"""What :func:`sampled_material` draws from, SI: D-LAYERS' ranges, widened to hold the default material, which bends and
-slides more easily (D-LAYERS bends like leather)."""
+"""Ranges from which :func:`sampled_material` draws, in SI units: D-LAYERS' ranges, widened to include the default
+material, which bends and slides more easily (D-LAYERS bends like leather)."""
 
 
 def sampled_material(rng: np.random.Generator) -> Material:

@@ -1,19 +1,19 @@
-"""Recorded sequences rolled out: by a network from recorded frames, and by two baselines without one.
+"""Rollouts of recorded sequences: by a network from recorded frames, and by two baselines without a network.
 
-`predict` starts from as many frames as the network remembers, or cold, from one: the recorded frame repeated on a body
-that stands still, which is what the network was trained on. The baselines say what a network is worth.
+`predict` starts from the network's whole history of frames, or cold, from a single frame: the recorded frame repeated
+on a body that stands still, as in training. The baselines show the benefit of a network.
 
-**Skinned**: the garment is skin. In the first frame every vertex V finds its nearest body point p; the face that
-holds p and the `neighbours - 1` faces with the nearest centroids to p carry it. To each it is bound at the face's
-point p_f that is nearest to V (barycentric), with the offset V - p_f turning with the face (the polar factor R_f of
-its deformation gradient since the first frame). The vertex is the mean of where its faces take it, p_f(t) + R_f(t) (V
-- p_f), weighted by 1 / (|p - p_f|^2 + s^2), s = 3 cm. In the first frame this is exact.
+**Skinned**: the garment moves like skin. For every vertex V, p is the nearest body point in the first frame; the face
+that holds p and the `neighbours - 1` faces with the nearest centroids to p carry the vertex. It is bound to each face
+at the point p_f of the face that is nearest to V (barycentric), with the offset V - p_f turning with the face (the
+polar factor R_f of its deformation gradient since the first frame). The vertex is at the mean of the positions
+p_f(t) + R_f(t) (V - p_f), weighted by 1 / (|p - p_f|^2 + s^2), s = 3 cm. In the first frame this is exact.
 
 **Rigid**: every connected component is a rigid body. It takes the rotation and translation that fit best (Kabsch) the
 motion of the body vertices nearest to the component's vertices in the first frame.
 
-Neither looks at gravity, inertia or collisions, and both start from one recorded frame. Pins need no care: the
-skinned garment is tied to the body everywhere, and the rigid one nowhere.
+Neither baseline considers gravity, inertia or collisions, and both start from one recorded frame. Pins have no effect:
+the skinned garment is tied to the body everywhere, and the rigid one nowhere.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ def predict(
     """Rolls a sequence out from its recorded frames.
 
     Args:
-        simulator: A `Simulator`.
-        sequence: A `Sequence` of a data set; less will do where `body` is given.
-        newest: The newest recorded frame that the network may see.
-        steps: Frames to predict; frame `newest + steps` of the body must exist.
-        cold: See only that one frame.
-        body: `sequence.body()`, where the caller has it already.
+        simulator: Simulator with the network.
+        sequence: Recorded sequence, a `training.data.sequence.Sequence`.
+        newest: Index of the newest recorded frame that is an input of the network.
+        steps: Number of frames to predict; frame `newest + steps` of the body must exist.
+        cold: Whether that frame is the only recorded frame that is an input.
+        body: The body of the sequence, `sequence.body()`, if the caller has it already.
 
     Returns:
         Vertices of frames newest+1 .. newest+steps [m], float32 [steps,V,3]; NaN after a rollout that failed.
@@ -90,7 +90,7 @@ def predict(
     else:
         raise ValueError(f"a warm start needs {history} recorded frames; up to frame {newest} there are {newest + 1}")
     part = BodyMotion(body.vertices[first : newest + steps + 1], body.faces, body.fps)
-    with warnings.catch_warnings():  # a rollout that fails shows in the figures
+    with warnings.catch_warnings():  # a rollout that fails is visible in the figures
         warnings.simplefilter("ignore", RuntimeWarning)
         motion = simulator.rollout(sequence.garment, part, first_vertices=start, history=known)
     predicted = np.full((steps, *sequence.vertices.shape[1:]), np.nan, np.float32)
@@ -108,13 +108,13 @@ SMOOTHING = 0.03  # metres
 def skinned(
     garment: Garment, first_vertices: np.ndarray, body: BodyMotion, *, neighbours: int = NEIGHBOURS
 ) -> np.ndarray:
-    """The garment as skin.
+    """The garment moving like skin.
 
     Args:
-        garment: For symmetry with `rigid`; only the positions matter here.
-        first_vertices: Garment in the body's first frame [m], [V,3].
+        garment: The garment, which is not read; it makes the arguments those of `rigid`.
+        first_vertices: Garment vertices in the body's first frame [m], [V,3].
         body: Body motion, T frames.
-        neighbours: Body faces that carry each vertex.
+        neighbours: Number of body faces that carry each vertex.
 
     Returns:
         Vertices [m], float32 [T,V,3]; frame 0 is `first_vertices`.
@@ -154,8 +154,8 @@ def rigid(garment: Garment, first_vertices: np.ndarray, body: BodyMotion) -> np.
     """Every component of the garment as a rigid body that follows the body beneath it.
 
     Args:
-        garment: Whose components move each on their own.
-        first_vertices: Garment in the body's first frame [m], [V,3].
+        garment: Garment whose components move separately.
+        first_vertices: Garment vertices in the body's first frame [m], [V,3].
         body: Body motion, T frames.
 
     Returns:
@@ -167,17 +167,25 @@ def rigid(garment: Garment, first_vertices: np.ndarray, body: BodyMotion) -> np.
     _, nearest = cKDTree(start).query(first)
     moved = np.empty((body.frames, len(first), 3), np.float32)
     for c in range(count):
-        mine = np.asarray(component) == c
-        below = np.unique(nearest[mine])
+        of_component = np.asarray(component) == c
+        below = np.unique(nearest[of_component])
         for t in range(body.frames):
             rotation, translation = kabsch(start[below], np.asarray(body.vertices[t], np.float64)[below])
-            moved[t, mine] = first[mine] @ rotation.T + translation
+            moved[t, of_component] = first[of_component] @ rotation.T + translation
     moved[0] = first_vertices
     return moved
 
 
 def kabsch(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rotation R and translation s that minimise sum |R source + s - target|^2; [N,3], [N,3] -> [3,3], [3]."""
+    """The rigid motion that minimises sum |R source + s - target|^2 (Kabsch 1976).
+
+    Args:
+        source: Points before the motion [m], [N,3].
+        target: Points after the motion [m], [N,3].
+
+    Returns:
+        Rotation R, [3,3], and translation s [m], [3].
+    """
     a, b = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((target - b).T @ (source - a))
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])

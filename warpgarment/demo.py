@@ -1,6 +1,6 @@
-"""The demo: bundled garments on a bundled walking body, by the network that ships, beside their ground truth.
+"""The demo: bundled garments on a bundled walking body, simulated by the bundled network, beside their ground truth.
 
-`assets()` is also a first thing to play with: a body in motion, two garments, and physics to compare with.
+`assets()` returns these data for first experiments: a body in motion, two garments, and physics to compare with.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ class DemoGarment:
     """A bundled garment.
 
     Attributes:
-        garment: At rest, with its pins.
-        truth: Simulated by the physics teacher on the demo's body, float32 [T, V, 3]; never seen in training.
+        garment: Garment at rest, with its pins.
+        truth: Motion of the garment on the demo's body as simulated by the physics teacher, T frames; it is not among
+            the training data.
     """
 
     garment: Garment
@@ -46,12 +47,12 @@ class DemoGarment:
 
 @dataclass(frozen=True)
 class DemoAssets:
-    """What ships for the demo.
+    """Bundled data of the demo.
 
     Attributes:
-        body: All of the walking body, to look at.
-        collider: What garments collide with: the body without parts such as hands.
-        garments: By name.
+        body: The whole walking body, for pictures.
+        collider: The body without parts such as hands, with which garments collide.
+        garments: Garments by name.
     """
 
     body: BodyMotion
@@ -60,7 +61,10 @@ class DemoAssets:
 
 
 def assets(folder: str | Path | None = None) -> DemoAssets:
-    """Reads the bundled assets, or others of the same layout: body.npz and one .npz per garment.
+    """Reads the bundled assets, or those of another folder with body.npz and one .npz per garment.
+
+    Args:
+        folder: Folder to read; None for the bundled one.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -94,20 +98,21 @@ def run(
     folder: str | Path | None = None,
     progress: bool = False,
 ) -> dict[str, GarmentMotion]:
-    """Rolls out, writes everything to `out`, prints the table.
+    """Rolls the garments out, writes the results to a folder and prints a table of them.
 
     Args:
-        out: Folder for dress.usd, dress.pc2 with dress.obj, the same of the T-shirt, rollout.png and demo.mp4.
-        device: "cpu" or "cuda"; None takes CUDA where there is any.
-        weights: As `Simulator.from_pretrained`.
-        frames: Only so many.
-        moments: Columns of rollout.png.
-        film: Whether to draw demo.mp4.
-        folder: Other assets.
-        progress: Show progress bars.
+        out: Folder for dress.usd, dress.pc2 with dress.obj, the corresponding files of the T-shirt, rollout.png and
+            demo.mp4.
+        device: "cpu" or "cuda"; None takes CUDA if it is available.
+        weights: Name or path of a checkpoint, as for `Simulator.from_pretrained`.
+        frames: Number of frames to simulate; None for all.
+        moments: Number of columns of rollout.png.
+        film: Whether demo.mp4 is drawn.
+        folder: Folder of other assets; None for the bundled ones.
+        progress: Whether progress bars are shown.
 
     Returns:
-        The garments' motions by name.
+        Motions of the garments by name.
     """
     from warpgarment.sim.simulator import Simulator
 
@@ -122,7 +127,7 @@ def run(
         first = item.first_vertices
         simulator.rollout(
             item.garment, bundle.collider, first_vertices=first, frames=3, face_splits=splits
-        )  # compiles what is not compiled
+        )  # compiles the kernels that are not compiled yet
         simulator.timings.clear()
         count = min(frames or item.truth.frames, item.truth.frames)
         motions[name] = motion = simulator.rollout(
@@ -142,7 +147,7 @@ def run(
     brush = str(simulator.device)
     draw.contact_sheet(out / "rollout.png", body, list(motions.values()), truth, frames=moments, device=brush)
     if film:
-        # on a CPU every second picture: drawing them all would take longer than simulating them
+        # On a CPU only every second frame is drawn: drawing all of them would take longer than the simulation.
         step = 2 if simulator.device.type == "cpu" else 1
         pictures = _film(body, list(motions.values()), truth, range(0, body.frames, step), brush)
         draw.write_mp4(out / "demo.mp4", pictures, body.fps / step)
@@ -158,7 +163,7 @@ def _until(body: BodyMotion, frames: int) -> BodyMotion:
 def _film(
     body: BodyMotion, motions: Sequence[GarmentMotion], truth: Sequence[GarmentMotion], frames: range, device: str
 ) -> Iterator[np.ndarray]:
-    """Each garment by the network and by physics, side by side."""
+    """Pictures of each garment as simulated by the network and by physics, side by side, uint8 [H, W, 3]."""
     size = (240, 400)
     camera = draw.chase([body, *truth], size=size)
     panels, labels = [], []

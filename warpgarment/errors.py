@@ -12,15 +12,15 @@ class CheckpointError(ValueError):
 
 
 class NotEnoughMemory(MemoryError):
-    """A batch that would not fit: says what needs how much, how much there is, and which setting makes it fit."""
+    """A batch that would not fit in memory: names the parts, their sizes, the memory, and the setting that helps."""
 
 
 class MissingExtra(ImportError):
     """An optional package is not installed.
 
     Args:
-        extra: The extra of this package that brings it, such as ``usd``.
-        purpose: What needs it, as the start of a sentence.
+        extra: Name of this package's extra that installs it, such as ``usd``.
+        purpose: Feature that needs it, as the subject of a sentence.
     """
 
     def __init__(self, extra: str, purpose: str = "This"):

@@ -1,8 +1,7 @@
-"""How far a prediction is from the truth, and how much of it lies inside the body or another layer.
+"""Errors of a prediction against the ground truth, and collisions with the body or another layer.
 
-Everything takes NumPy arrays or torch tensors, one frame or a sequence, and returns a float. A sequence's figure is
-the mean over its frames (the largest for `max_penetration`). Positions that are not finite give nan rather than a
-figure about the rest.
+All functions take NumPy arrays or torch tensors, one frame or a sequence, and return a float. The figure of a sequence
+is the mean over its frames (the largest for `max_penetration`). If any position is not finite, the figure is nan.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ def mean_vertex_error(pred: Any, truth: Any) -> float:
     """Mean distance between corresponding vertices, in **centimetres** (section 5.1: mean over vertices and frames).
 
     Args:
-        pred: Positions [m], shape [V,3] or [T,V,3].
-        truth: The same shape.
+        pred: Predicted positions [m], shape [V,3] or [T,V,3].
+        truth: True positions [m], in the shape of `pred`.
 
     Raises:
-        ValueError: Other shapes.
+        ValueError: The shapes are others, or differ.
     """
     pred, truth = _frames(pred, "pred"), _frames(truth, "truth")
     if pred.shape != truth.shape:
@@ -48,7 +47,7 @@ def chamfer_distance(points_a: Any, points_b: Any) -> float:
         points_b: Points [m], shape [M,3] or [T,M,3].
 
     Raises:
-        ValueError: Other shapes.
+        ValueError: The shapes are others, or the numbers of frames differ.
     """
     a, b = _frames(points_a, "points_a"), _frames(points_b, "points_b")
     a, b = _same_frames(a, b, "points_a", "points_b")
@@ -63,20 +62,20 @@ def _directed(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def geodesic_distortion(pred: Any, truth: Any, faces: Any, *, sources: int = 32, seed: int = 0) -> float:
-    """Mean |D_pred - D_truth| [m] over sampled pairs of faces, D the distance over the surface (section 5.1).
+    """Mean |D_pred - D_truth| [m] over sampled pairs of faces, where D is the distance over the surface (section 5.1).
 
-    The pairs are all faces against `sources` of them drawn at random without repetition, the same ones for all frames;
+    The pairs are all faces with `sources` of them, which are drawn at random without repetition, once for all frames;
     with as many sources as faces, these are all pairs. Pairs on different components are left out.
 
     Args:
-        pred: Positions [m], shape [V,3] or [T,V,3].
-        truth: The same shape.
+        pred: Predicted positions [m], shape [V,3] or [T,V,3].
+        truth: True positions [m], in the shape of `pred`.
         faces: Vertex indices, shape [F,3].
-        sources: How many faces to measure from.
-        seed: Of the drawing.
+        sources: Number of faces from which distances are measured.
+        seed: Seed of the random choice of sources.
 
     Raises:
-        ValueError: Other shapes, a non-manifold mesh (MeshError), a single face, or no source.
+        ValueError: The shapes are others, the mesh is not a manifold (MeshError), there is a single face, or no source.
     """
     pred, truth = _frames(pred, "pred"), _frames(truth, "truth")
     if pred.shape != truth.shape:
@@ -102,22 +101,25 @@ def geodesic_distortion(pred: Any, truth: Any, faces: Any, *, sources: int = 32,
 
 
 def body_collision(vertices: Any, body_vertices: Any, body_faces: Any) -> float:
-    """Share (0 to 1) of garment vertices with negative signed distance to the body, the sign by winding numbers.
+    """Share (0 to 1) of garment vertices with negative signed distance to the body; the sign is by winding numbers.
 
     Args:
         vertices: Garment positions [m], shape [V,3] or [T,V,3].
-        body_vertices: Body positions [m], shape [U,3] or [T,U,3]; a single frame serves all.
+        body_vertices: Body positions [m], shape [U,3] or [T,U,3]; a single frame is used for all garment frames.
         body_faces: Vertex indices, shape [G,3]; faces that look inwards are turned round, with a warning.
 
     Raises:
-        ValueError: Other shapes, or indices out of range.
+        ValueError: The shapes are others, or an index is out of range.
     """
     distance = _body_distance(vertices, body_vertices, body_faces)
     return float((distance < 0).mean()) if np.isfinite(distance).all() else float("nan")
 
 
 def max_penetration(vertices: Any, body_vertices: Any, body_faces: Any) -> float:
-    """Depth of the deepest garment vertex of all frames below the body [m], at least 0; else as `body_collision`."""
+    """Depth of the deepest garment vertex of all frames below the body's surface [m], at least 0.
+
+    Arguments and errors are those of `body_collision`.
+    """
     distance = _body_distance(vertices, body_vertices, body_faces)
     return max(0.0, -float(distance.min())) if np.isfinite(distance).all() else float("nan")
 
@@ -125,18 +127,19 @@ def max_penetration(vertices: Any, body_vertices: Any, body_faces: Any) -> float
 def layer_collision(outer_vertices: Any, inner_vertices: Any, inner_faces: Any) -> float:
     """Share (0 to 1) of an outer garment's vertices that have gone through the inner one.
 
-    Garments are open, so there is no inside to count windings about. A vertex has gone through when its closest point
-    of the inner garment is not on the border and it lies on the back of the surface there, by the angle-weighted normal
-    (Baerentzen and Aanaes 2005). Past the border, as with a coat longer than the shirt below it, the two sides are
-    not defined and the vertex does not count.
+    Garments are open, so winding numbers do not define an inside. A vertex has gone through if its closest point on the
+    inner garment is not on the border and the vertex lies behind the surface there, by the angle-weighted normal
+    (Baerentzen and Aanaes 2005). Past the border, as for a coat longer than the shirt below it, the two sides are not
+    defined and the vertex does not count.
 
     Args:
-        outer_vertices: Positions [m], shape [V,3] or [T,V,3].
-        inner_vertices: Positions [m], shape [W,3] or [T,W,3]; a single frame serves all.
-        inner_faces: Vertex indices, counter-clockwise seen from outside, shape [G,3].
+        outer_vertices: Positions of the outer garment [m], shape [V,3] or [T,V,3].
+        inner_vertices: Positions of the inner garment [m], shape [W,3] or [T,W,3]; a single frame is used for all
+            frames of the outer garment.
+        inner_faces: Vertex indices of the inner garment, counter-clockwise seen from outside, shape [G,3].
 
     Raises:
-        ValueError: Other shapes, indices out of range, or a non-manifold inner mesh.
+        ValueError: The shapes are others, an index is out of range, or the inner mesh is not a manifold.
     """
     outer, inner = _frames(outer_vertices, "outer_vertices"), _frames(inner_vertices, "inner_vertices")
     outer, inner = _same_frames(outer, inner, "outer_vertices", "inner_vertices")
@@ -157,7 +160,7 @@ def layer_collision(outer_vertices: Any, inner_vertices: Any, inner_faces: Any) 
 def _through(
     outer: np.ndarray, inner: np.ndarray, faces: np.ndarray, border_edge: np.ndarray, border_corner: np.ndarray
 ) -> float:
-    """Share of one frame. A barycentric coordinate of 0 puts the closest point on an edge, one of 1 on a corner."""
+    """Share in one frame. A barycentric coordinate of 0 puts the closest point on an edge, one of 1 on a corner."""
     inner = np.ascontiguousarray(inner, dtype=np.float64)
     sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     distance, face, closest, _ = igl.signed_distance(np.ascontiguousarray(outer, dtype=np.float64), inner, faces, sign)
@@ -194,7 +197,7 @@ def _same_frames(a: np.ndarray, b: np.ndarray, name_a: str, name_b: str) -> tupl
 
 
 def _body_distance(vertices: Any, body_vertices: Any, body_faces: Any) -> np.ndarray:
-    """Signed distances, shape [T,V]; nan where a position is not finite."""
+    """Signed distances [m], shape [T,V]; nan where a position is not finite."""
     points, body = _frames(vertices, "vertices"), _frames(body_vertices, "body_vertices")
     faces = checked_faces(body_faces, body.shape[1], name="body_faces")
     points, body = _same_frames(points, body, "vertices", "body_vertices")

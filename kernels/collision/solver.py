@@ -50,7 +50,7 @@ TOLERANCE = 2e-6
 """Error of a solve in the energy norm [m].
 
 Measured on skirts of 1,000 to 10,000 faces, 15 mm deep in a body, solved for displacements: the worst vertex is off by
-0.02 to 0.03 mm at 1e-5 or 5e-6 and 0.009 mm at 2e-6. For contact forces see `collision_operator.RESIDUAL`.
+0.02 to 0.03 mm at 1e-5 or 5e-6 and 0.009 mm at 2e-6. For contact forces see `operator.RESIDUAL`.
 """
 
 
@@ -121,9 +121,9 @@ class CollisionSolver:
         """What the last refinement says: iterations, components stopped by the limit, their largest error; not read."""
         return self._progress.summary()
 
-    def tell(self, stopped: float, error: float) -> None:
+    def warn_if_stopped(self, stopped: float, error: float) -> None:
         """Warns, once, if a summary that was read from the device says that components were stopped."""
-        self._progress.tell(stopped, self.component_count, error)
+        self._progress.warn_if_stopped(stopped, self.component_count, error)
 
     @property
     def contacts(self) -> int:

@@ -48,10 +48,10 @@ class FaceMeans:
     """Means over segments of the faces of packed meshes; without gradients (`deformation.segment_mean` has them).
 
     Args:
-        faces: int32 [F, 3].
+        faces: Packed vertex indices, int32 [F, 3].
         segment: Segment of each face, int32 [F], within [0, count).
         count: Number of segments.
-        vertex_count: V.
+        vertex_count: Number of vertices V.
 
     Raises:
         TypeError, ValueError: Wrong dtypes, shapes or devices; faces or segments out of range.
@@ -71,7 +71,14 @@ class FaceMeans:
         self.count, self.vertex_count = count, vertex_count
 
     def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
-        """Positions [m], float32 [V, 3], to means [m], float32 [count, 3]; zero for a segment without faces."""
+        """Means of the face centroids of each segment.
+
+        Args:
+            vertices: Positions [m], float32 [V, 3].
+
+        Returns:
+            Means [m], float32 [count, 3]; zero for a segment without faces.
+        """
         expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
         means = allocate((self.count, 3), torch.float32, self.device)
         if self.count:

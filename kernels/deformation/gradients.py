@@ -14,7 +14,7 @@ Manifold-aware transformers, supplement 1.1 and 1.2 (after Sumner and Popović 2
     | c      | centroid                      | mean of a face's corners                      |
 
 Φ maps unit normals to unit normals, so one of its singular values is always 1. A face without area has no normal: its
-n, and with it one column of Q, is zero. A face that names a vertex which is not there gives NaN and reads nothing.
+n, and with it one column of Q, is zero. A face with an index out of range gives NaN, and no memory is read for it.
 """
 
 from __future__ import annotations
@@ -170,7 +170,17 @@ _relative_deformation_gradient = row_operator(
 
 
 def expect_mesh(vertices: torch.Tensor, faces: torch.Tensor, name: str = "vertices") -> None:
-    """Refuses anything but vertices float32 [V, 3] and faces int32 [F, 3] on one device."""
+    """Refuses arguments that are not vertices float32 [V, 3] and faces int32 [F, 3] on one device.
+
+    Args:
+        vertices: Positions to check.
+        faces: Vertex indices to check.
+        name: Name of the argument `vertices`, for error messages.
+
+    Raises:
+        TypeError: Another dtype.
+        ValueError: Another shape, or two devices.
+    """
     expect(name, vertices, (None, 3))
     expect("faces", faces, (None, 3), torch.int32, vertices.device)
 
@@ -180,7 +190,7 @@ def face_frames(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
 
     Args:
         vertices: Positions [m], float32 [V, 3].
-        faces: int32 [F, 3].
+        faces: Vertex indices, int32 [F, 3].
 
     Returns:
         float32 [F, 3, 3]; columns are two edges [m] and the unit normal. Differentiable in the vertices.
@@ -190,25 +200,41 @@ def face_frames(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
 
 
 def face_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Unit normals of faces, float32 [F, 3]; zero where a face has no area. Differentiable in the vertices."""
+    """Unit normals of faces.
+
+    Args:
+        vertices: Positions [m], float32 [V, 3].
+        faces: Vertex indices, int32 [F, 3].
+
+    Returns:
+        float32 [F, 3]; zero where a face has no area. Differentiable in the vertices.
+    """
     return face_frames(vertices, faces)[:, :, 2]
 
 
 def face_centroids(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Means of the corners of faces [m], float32 [F, 3]. Differentiable in the vertices."""
+    """Centroids of faces, the means of their corners.
+
+    Args:
+        vertices: Positions [m], float32 [V, 3].
+        faces: Vertex indices, int32 [F, 3].
+
+    Returns:
+        Centroids [m], float32 [F, 3]. Differentiable in the vertices.
+    """
     expect_mesh(vertices, faces)
     return _face_centroids(vertices, faces)
 
 
 def inverse_rest_frames(rest_vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Q_rest⁻¹ of faces, inverted in float64: constant per garment, made once.
+    """Q_rest⁻¹ of faces, inverted in float64. It is constant per garment and therefore computed once.
 
     Args:
         rest_vertices: Rest positions [m], float32 [V, 3].
-        faces: int32 [F, 3].
+        faces: Vertex indices, int32 [F, 3].
 
     Returns:
-        float32 [F, 3, 3], without gradient; zero where a rest face has no area.
+        float32 [F, 3, 3], without gradient; rows 0 and 1 in 1/m, row 2 without unit; zero for a rest face without area.
     """
     expect_mesh(rest_vertices, faces, "rest_vertices")
     return _inverse_rest_frames(rest_vertices.detach(), faces)
@@ -217,12 +243,12 @@ def inverse_rest_frames(rest_vertices: torch.Tensor, faces: torch.Tensor) -> tor
 def deformation_gradient_from_inverse(
     inverse_rest: torch.Tensor, vertices: torch.Tensor, faces: torch.Tensor
 ) -> torch.Tensor:
-    """Deformation gradients Φ = Q Q_rest⁻¹ from frames inverted before.
+    """Deformation gradients Φ = Q Q_rest⁻¹ from rest frames that were inverted before.
 
     Args:
-        inverse_rest: From `inverse_rest_frames`, float32 [F, 3, 3].
+        inverse_rest: Inverse rest frames from `inverse_rest_frames`, float32 [F, 3, 3].
         vertices: Positions [m], float32 [V, 3].
-        faces: int32 [F, 3].
+        faces: Vertex indices, int32 [F, 3].
 
     Returns:
         float32 [F, 3, 3], dimensionless. Differentiable in the vertices.
@@ -238,7 +264,7 @@ def deformation_gradient(rest_vertices: torch.Tensor, vertices: torch.Tensor, fa
     Args:
         rest_vertices: Rest positions [m], float32 [V, 3].
         vertices: Positions [m], float32 [V, 3].
-        faces: int32 [F, 3].
+        faces: Vertex indices, int32 [F, 3].
 
     Returns:
         float32 [F, 3, 3], dimensionless. Differentiable in `vertices`.
@@ -261,7 +287,7 @@ def relative_deformation_gradient(phi_next: torch.Tensor, phi: torch.Tensor) -> 
         phi: Deformation gradients of the earlier frame, float32 [F, 3, 3].
 
     Returns:
-        float32 [F, 3, 3]. Differentiable in both.
+        float32 [F, 3, 3], dimensionless. Differentiable in both arguments.
     """
     expect("phi", phi, (None, 3, 3))
     expect("phi_next", phi_next, tuple(phi.shape), device=phi.device)
@@ -269,15 +295,16 @@ def relative_deformation_gradient(phi_next: torch.Tensor, phi: torch.Tensor) -> 
 
 
 def segment_mean(values: torch.Tensor, segment: torch.Tensor, count: int) -> torch.Tensor:
-    """Means of rows that share a segment: of the faces of a component, say.
+    """Means of the rows of each segment, for example of the faces of each component.
 
     Args:
-        values: float32 [F, K].
+        values: Rows in any unit, float32 [F, K].
         segment: Segment of each row, int32 [F], within [0, count).
         count: Number of segments.
 
     Returns:
-        float32 [count, K]; zero for a segment without rows. Differentiable; in row order, so repeatable, on the CPU.
+        Means in the unit of `values`, float32 [count, K]; zero for a segment without rows. Differentiable in `values`.
+        The CPU sums in the order of rows, so that its results are repeatable.
     """
     expect("values", values, (None, None))
     expect("segment", segment, (values.shape[0],), torch.int32, values.device)

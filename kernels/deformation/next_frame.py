@@ -1,16 +1,16 @@
-"""The deformation gradients a garment should have next: steps 2 and 3 of Algorithm 1, in two launches.
+"""The deformation gradients of a garment in the next frame: steps 2 and 3 of Algorithm 1, in two launches.
 
 Manifold-aware transformers, Algorithm 1: "Φ ← Ψ Φ, replace singular values of Φ with Σ" (svd.py).
 
     | paper | code            | what                                                        |
     | ----- | --------------- | ----------------------------------------------------------- |
     | Ψ     | psi             | predicted relative deformation gradient                     |
-    | Φ     | features, first | of the newest frame, row-major in the first nine columns    |
-    | Σ     | singular_values | predicted                                                   |
+    | Φ     | features        | of the newest frame, row-major in the first nine columns    |
+    | Σ     | singular_values | predicted singular values of ΨΦ                             |
     | q     | velocity        | predicted change of the mean of each component [m]          |
 
-A garment of which any number is NaN or infinite keeps its Φ (with all singular values 1 if they are replaced), so that
-it cannot spoil the others of its batch in a solver.
+A garment with any predicted number that is NaN or infinite keeps its Φ (with all singular values 1 if they are
+replaced), so that it cannot spoil the solutions of the other garments in the batch.
 """
 
 from __future__ import annotations
@@ -84,21 +84,25 @@ def next_gradients(
     replace: bool = True,
     smallest: float = 1e-3,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Ψ Φ with other singular values, and whose prediction is finite; without gradients.
+    """ΨΦ with the predicted singular values, and which garments have a finite prediction; without gradients.
 
     Args:
-        features: Of the newest frame (`features.LAYOUT`), float32 [F, 34].
-        psi: float32 [F, 3, 3].
-        singular_values: Descending, float32 [F, 3].
-        velocity: float32 [C, 3].
-        component_of_face: int32 [F], within [0, C).
-        garment_of_face: int32 [F], within [0, garments).
-        garments: B.
+        features: Features of the faces in the newest frame, in the columns of `features.LAYOUT`, float32 [F, 34].
+        psi: Predicted relative deformation gradients Ψ, float32 [F, 3, 3].
+        singular_values: Predicted singular values Σ in descending order, float32 [F, 3].
+        velocity: Predicted change of the mean of each component q [m], float32 [C, 3].
+        component_of_face: Component of each face, int32 [F], within [0, C).
+        garment_of_face: Garment of each face, int32 [F], within [0, garments).
+        garments: Number of garments B.
         replace: Whether the singular values of ΨΦ are replaced.
-        smallest: What replaces them is at least this; a face squeezed further would fold onto itself.
+        smallest: Lower limit of the new singular values; a face squeezed further would fold onto itself.
 
     Returns:
-        Deformation gradients, float32 [F, 3, 3], and whether all numbers of a garment are finite, bool [B].
+        Deformation gradients, float32 [F, 3, 3], and whether all predicted numbers of a garment are finite, bool [B].
+
+    Raises:
+        TypeError: An argument has another dtype.
+        ValueError: An argument has another shape or is on another device.
     """
     rows, device = len(psi), psi.device
     expect("psi", psi, (None, 3, 3))

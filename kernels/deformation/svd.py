@@ -1,7 +1,7 @@
 """Singular values of deformation gradients: reading them, replacing them, removing them.
 
 Manifold-aware transformers, section 4.3.1 and Algorithm 1 ("replace singular values of Φ with Σ"). The network
-predicts the singular values of a face's deformation gradient apart from the gradient itself, because they say how
+predicts the singular values of a face's deformation gradient apart from the gradient itself, because they measure how
 much cloth stretches; here they are put back:
 
     Φ = U diag(σ) Vᵀ,    R(Φ, s) = U diag(|s|) Vᵀ,    U and V proper rotations, σ₁ >= σ₂ >= |σ₃|
@@ -10,7 +10,7 @@ much cloth stretches; here they are put back:
     | ----- | --------------- | ---------------------------------------------------------------------- |
     | Φ     | phi             | deformation gradient of a face, 3x3                                    |
     | Σ     | singular_values | its singular values, descending, never negative                        |
-    | σ     | sigma           | the same with the sign of det Φ on the smallest, as proper U, V demand |
+    | σ     | sigma           | Σ with the sign of det Φ on the smallest, since U and V are proper     |
 
 Gradients. With P = Uᵀ dΦ V and T = Uᵀ dR V, the rotations of U and V follow from the off-diagonal of P, and for i < j
 
@@ -18,17 +18,18 @@ Gradients. With P = Uᵀ dΦ V and T = Uᵀ dR V, the rotations of U and V follo
     T_ij − T_ji = (s_i + s_j)/(σ_i + σ_j) (P_ij − P_ji)
     T_ii = ds_i
 
-R jumps where σ_i = σ_j but s_i != s_j, so the first quotient has no limit there (an undeformed face is such a place).
-Both are held below `MAX_GAIN`: gradients are exact wherever R amplifies less than that, and bounded everywhere.
+R jumps where σ_i = σ_j but s_i != s_j, so the first quotient has no limit there (an undeformed face is such a case).
+Both quotients are limited to `MAX_GAIN`: gradients are exact wherever R amplifies less than that, and always bounded.
 
 The decomposition runs in float64 (Warp's float32 one is off by 2e-4 on garments), by one-sided Jacobi rotations
-(Hestenes 1958): columns of A = Φ V are turned against each other until they are orthogonal; then σ are their lengths
-and U their directions. Stretched cloth is nearly orthogonal to begin with, so two or three sweeps do, where Warp's
-`svd3` always makes the same many.
+(Hestenes 1958): pairs of columns of A = Φ V are rotated until they are orthogonal; then σ are their lengths and U their
+directions. The columns of stretched cloth are nearly orthogonal at the start, so two or three sweeps suffice; Warp's
+`svd3` always makes a fixed number of sweeps.
 
 For Φ = [e1, e2, n] Q_rest⁻¹ (gradients.py) no decomposition is needed. With r_k the rows of Q_rest⁻¹, r_2 is
-orthogonal to the others and n to the edges: |n| |r_2| = 1 is one value (0 for a face without area), and the other two
-are those of a map between planes, with columns m, k in an orthonormal basis along r_0:
+orthogonal to the other rows and n to the edges: |n| |r_2| = 1 is one singular value (0 for a face without area), and
+the other two are those of a map between planes, whose columns are m and k in an orthonormal basis with r_0 along its
+first axis:
 
     (σ₁ ± σ₂)² = |m|² + |k|² ± 2 |m × k|,    (σ₁ − σ₂)² = (|m| − |k|)² + 2 (m·k)² / (|m||k| + |m × k|)
 """
@@ -47,14 +48,14 @@ MAX_GAIN = wp.constant(wp.float64(100.0))
 
 # Cosine between two columns, squared, below which they count as orthogonal
 ORTHOGONAL = wp.constant(wp.float64(1.0e-26))
-SWEEPS = wp.constant(16)  # never reached
+SWEEPS = wp.constant(16)  # a limit that is never reached
 # Second singular value over the first below which its direction is rounding
 FLAT = wp.constant(wp.float64(1.0e-14))
 
 
 @wp.func
 def turn(x: wp.vec3d, y: wp.vec3d):
-    """Cosine and sine of the rotation that makes two columns orthogonal; 1 and 0 where they are."""
+    """Cosine and sine of the rotation that makes two columns orthogonal; 1 and 0 if they already are."""
     one = wp.float64(1.0)
     xx = wp.dot(x, x)
     yy = wp.dot(y, y)
@@ -132,7 +133,7 @@ def singular_values_of(phi: wp.mat33):
 
 @wp.func_grad(singular_values_of)
 def adj_singular_values_of(phi: wp.mat33, adj_ret: wp.vec3):
-    """dσ_i = u_iᵀ dΦ v_i: no quotient, so repeated values do no harm."""
+    """dσ_i = u_iᵀ dΦ v_i contains no quotient, so repeated singular values do no harm."""
     u, sigma, v = svd(wp.mat33d(phi))
     g = wp.vec3d(adj_ret)
     if sigma[2] < wp.float64(0.0):
@@ -142,7 +143,7 @@ def adj_singular_values_of(phi: wp.mat33, adj_ret: wp.vec3):
 
 @wp.func
 def frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33):
-    """Singular values, descending, of Φ = Q Q_rest⁻¹ with Q = [e1, e2, n]: see above."""
+    """Singular values, descending, of Φ = Q Q_rest⁻¹ with Q = [e1, e2, n]; the formulas are those of the module."""
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     f = wp.mat33d(q)
@@ -172,7 +173,7 @@ def frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33):
 
 @wp.func_grad(frame_singular_values)
 def adj_frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33, adj_ret: wp.vec3):
-    """That of the singular values of the product."""
+    """The adjoint of the singular values of the product of both matrices."""
     u, sigma, v = svd(wp.mat33d(q * inverse_rest))
     g = wp.vec3d(adj_ret)
     if sigma[2] < wp.float64(0.0):
@@ -192,7 +193,7 @@ def with_singular_values(phi: wp.mat33, values: wp.vec3):
 
 @wp.func
 def bounded_quotient(numerator: wp.float64, denominator: wp.float64):
-    """numerator / denominator for denominator >= 0, cut off at ±MAX_GAIN; 0 / 0 is 0."""
+    """numerator / denominator for denominator >= 0, limited to ±MAX_GAIN; 0 / 0 is 0."""
     if numerator == wp.float64(0.0):
         return wp.float64(0.0)
     if wp.abs(numerator) >= MAX_GAIN * denominator:
@@ -202,7 +203,7 @@ def bounded_quotient(numerator: wp.float64, denominator: wp.float64):
 
 @wp.func_grad(with_singular_values)
 def adj_with_singular_values(phi: wp.mat33, values: wp.vec3, adj_ret: wp.mat33):
-    """The map from P to T above is its own transpose, so it serves the adjoint as it stands."""
+    """The map from P to T in the module's docstring is its own transpose, so the adjoint uses it unchanged."""
     u, sigma, v = svd(wp.mat33d(phi))
     g = wp.transpose(u) * wp.mat33d(adj_ret) * v
     s = wp.vec3d(values)
@@ -265,25 +266,25 @@ def singular_values(phi: torch.Tensor) -> torch.Tensor:
         phi: Deformation gradients, float32 [F, 3, 3].
 
     Returns:
-        Singular values, float32 [F, 3], descending, never negative. Differentiable in phi, with u_i v_iᵀ.
+        Singular values, float32 [F, 3], descending, never negative. Differentiable in phi; ∂σ_i/∂Φ = u_i v_iᵀ.
     """
     expect("phi", phi, (None, 3, 3))
     return _singular_values(phi)
 
 
 def replace_singular_values(phi: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
-    """The matrices with other singular values: U diag(|s|) Vᵀ of phi = U diag(σ) Vᵀ.
+    """Replaces the singular values of 3x3 matrices: U diag(|s|) Vᵀ for phi = U diag(σ) Vᵀ.
 
     U and V are proper rotations, so the result has a positive determinant even where phi is inverted. A negative
-    value means its magnitude, as a singular value has no sign.
+    value counts as its magnitude, since singular values have no sign.
 
     Args:
         phi: Deformation gradients, float32 [F, 3, 3].
-        s: New singular values, float32 [F, 3]; s[:, 0] takes the place of the largest, and so on.
+        s: New singular values, float32 [F, 3]; s[:, 0] replaces the largest one, and so on.
 
     Returns:
-        float32 [F, 3, 3]. Differentiable in both; where singular values of phi meet, the gradient is bounded (see
-        `MAX_GAIN`).
+        float32 [F, 3, 3]. Differentiable in both arguments; where singular values of phi coincide, the gradient is
+        bounded (see `MAX_GAIN`).
     """
     expect("phi", phi, (None, 3, 3))
     expect("s", s, (phi.shape[0], 3), device=phi.device)
@@ -294,10 +295,10 @@ def rotation(phi: torch.Tensor) -> torch.Tensor:
     """The proper rotations nearest to 3x3 matrices: U Vᵀ, the polar factor.
 
     Args:
-        phi: float32 [F, 3, 3].
+        phi: Matrices, for example deformation gradients, float32 [F, 3, 3].
 
     Returns:
-        float32 [F, 3, 3], determinant +1. Differentiable.
+        Rotations with determinant +1, float32 [F, 3, 3]. Differentiable in phi.
     """
     expect("phi", phi, (None, 3, 3))
     return _replace_singular_values(phi, phi.new_ones(phi.shape[:2]))

@@ -9,16 +9,16 @@ The 3x3 diagonal blocks s_ii I + n_i n_iᵀ are inverted by Sherman-Morrison, wh
     M⁻¹ r = r / s - n (n·r) / (s (s + n·n))
 
 The decrease of the squared error in the energy norm, |e|² = eᵀ A e, is known exactly: step k lowers it by
-α_k r_kᵀ M⁻¹ r_k (Hestenes and Stiefel 1952). The iteration stops when what is left of it, judged from the last two
+α_k r_kᵀ M⁻¹ r_k (Hestenes and Stiefel 1952). The iteration stops when the remaining error, estimated from the last two
 windows of `WINDOW` steps, falls below the tolerance. All vectors are float64, which on one CPU core costs 0.18 ms an
-iteration for 5,000 vertices, hardly more than float32 (0.16 ms), and leaves no stagnation to guard against.
+iteration for 5,000 vertices, hardly more than float32 (0.16 ms), and rules out stagnation by rounding.
 
 | symbol | code | what |
 | --- | --- | --- |
-| S | `row_pointer, column, value` | CSR, [V,V], float64 |
-| s_ii | `diagonal` | [V] |
-| n_i | `normal` | [V,3]; zero where a vertex has no contact |
-| b, x | `rhs, solution` | [V,3] |
+| S | `row_pointer, column, value` | sparse matrix in CSR form, [V,V], float64 |
+| s_ii | `diagonal` | diagonal of S, [V], float64 |
+| n_i | `normal` | contact normals, [V,3], float64; zero where a vertex has no contact |
+| b, x | `rhs, solution` | right-hand side and solution, [V,3], float64 |
 """
 
 from __future__ import annotations
@@ -191,15 +191,16 @@ def solve(
     """Solves A x = b for every component, from zero.
 
     Args:
-        system: The constant part of A.
-        normal: n, float64 [V,3].
-        rhs: b, float64 [V,3].
-        tolerance: Error allowed in the energy norm, float64 [C].
-        relative: The same as a share of the energy norm of the solution; the looser of the two holds.
-        max_iterations: Limit per component.
+        system: The constant part S of A.
+        normal: Contact normals n, float64 [V,3]; zero where a vertex has no contact.
+        rhs: Right-hand side b, float64 [V,3].
+        tolerance: Error allowed in each component, in the energy norm, float64 [C].
+        relative: Error allowed as a share of the energy norm of the solution; the looser of the two limits holds.
+        max_iterations: Limit of iterations per component.
 
     Returns:
-        x float64 [V,3]; iterations int32 [C], negative where the limit ended them; estimated error float64 [C].
+        Solution x, float64 [V,3]; number of iterations, int32 [C], negative where the limit ended them; estimated
+        error in the energy norm, float64 [C].
     """
     system = System(*system)
     count, vertices = len(system.start) - 1, len(rhs)

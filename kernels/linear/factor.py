@@ -9,20 +9,20 @@ the factor. Two forms of it:
 | substitution | L by panels of four columns | one lane after the other: for a CPU |
 | explicit | W = L⁻¹ by columns and by rows | two sparse products, all rows at once: for a GPU |
 
-Column j of W reaches the ancestors of j in the elimination tree and nothing else, so that with `depth` counted from
-the root its entry in row r is at place depth_j - depth_r. (Liu 1990, "The role of elimination trees".) W has 7 to 15
-times as many entries as L for 1,000 to 25,000 vertices, and still 20 times fewer than A⁻¹.
+Column j of W has entries in the rows of the ancestors of j in the elimination tree and in no other, so that with
+`depth` counted from the root its entry in row r is at place depth_j - depth_r. (Liu 1990, "The role of elimination
+trees".) W has 7 to 15 times as many entries as L for 1,000 to 25,000 vertices, and still 20 times fewer than A⁻¹.
 
-A panel holds every row in which one of its four columns has an entry, and reads that row of x once for all four: half
-the entries of L are left, and each costs no more than an entry of a single column did.
+A panel holds every row in which at least one of its four columns has an entry, and each row of x is read once for all
+four columns. This halves the number of rows to visit, and one visit costs no more than an entry of a single column.
 
-A factor is tried on a random vector before it is trusted. Components whose matrix is too badly conditioned for it, or
-that don't fit in the budget, have none, and are left to conjugate_gradients.py.
+A factor is tried on a random vector before it is trusted. A component whose matrix is too badly conditioned, or whose
+factor does not fit in the budget, has no factor and is solved by conjugate_gradients.py.
 
 | symbol | code | what |
 | --- | --- | --- |
-| L | `pointer, column, value` | by panels: for each row (a place) below it, four numbers |
-| | `triangle` | [4,4] within a panel, strictly lower |
+| L | `pointer, column, value` | by panels: four numbers for each row (a place) below the panel |
+| | `triangle` | [4,4], the strictly lower part of L within a panel |
 | W | `pointer, column, value` | explicit form: strictly lower part by columns; indices are places |
 | Wᵀ | `row_pointer, row_column, row_value` | strictly lower part by rows |
 | D⁻¹ | `pivot` | one per place |
@@ -43,7 +43,7 @@ from scipy.sparse.linalg import splu
 from .system import System
 
 BUDGET = 2**26
-"""Numbers in all factors of a solver together, 8 bytes each and half as much for indices (768 MiB)."""
+"""Limit of the entries in all factors of a solver together; an entry takes 8 bytes and its index 4 (768 MiB in all)."""
 PANEL = 4
 TRUSTED = 1e-6
 """Error of a trial solve, as a share of its random solution, up to which a factor is used."""
@@ -55,28 +55,29 @@ class Factor(NamedTuple):
     base: torch.Tensor
     """int32 [C], where the places of a component begin in `order` and `pivot`; -1 for a component without a factor."""
     first: torch.Tensor
-    """int32 [C], where the work of a component begins; in the form for substitution padded to full panels."""
+    """int32 [C], where the work vector of a component begins; in the form for substitution padded to full panels."""
     order: torch.Tensor
     """int32 [R], the vertex within its component that is eliminated at this place; -1 where a panel is padded."""
     pivot: torch.Tensor
-    """float64 [R]."""
+    """float64 [R], the diagonal of D⁻¹."""
     triangle: torch.Tensor
-    """float64 [R/4,4,4]; empty in the explicit form."""
+    """float64 [R/4,4,4], strictly lower part of L within each panel; empty in the explicit form."""
     pointer: torch.Tensor
     column: torch.Tensor
     value: torch.Tensor
     row_pointer: torch.Tensor
     row_column: torch.Tensor
     row_value: torch.Tensor
-    """int32, int32 and float64; the last three are empty in the form for substitution."""
+    """Compressed matrices, int32, int32 and float64, as in the table above; the three of the rows are empty in the form
+    for substitution."""
     factored: int
-    """Components with a factor."""
+    """Number of components with a factor."""
     unfactored: int
-    """Components without."""
+    """Number of components without a factor."""
     explicit: bool
-    """The form of the factors."""
+    """Whether the factors have the explicit form."""
     places: int
-    """Places of all components."""
+    """Number of places of all components together."""
 
     @classmethod
     def build(
@@ -88,14 +89,15 @@ class Factor(NamedTuple):
         budget: int = BUDGET,
         skip: np.ndarray | None = None,
     ) -> Factor:
-        """Factors the diagonal blocks of a symmetric matrix [V,V], positive definite each, while the budget lasts.
+        """Factors the diagonal blocks of a symmetric matrix as long as the budget lasts.
 
         Args:
-            matrix: Float64. No entry joins two components.
-            system: Which vertices belong to a component.
-            explicit: The form of the factors.
-            budget: Entries of all factors together.
-            skip: Components that need no factor, bool [C].
+            matrix: Symmetric matrix, float64 [V,V], whose diagonal blocks are positive definite. No entry joins two
+                components.
+            system: System that assigns the vertices to components.
+            explicit: Whether the factors have the explicit form.
+            budget: Limit of the entries of all factors together.
+            skip: Whether a component needs no factor, bool [C].
         """
         device = system.value.device
         bases, lengths, parts = [], [], []
@@ -132,7 +134,7 @@ class Factor(NamedTuple):
 def component_blocks(
     matrix: scipy.sparse.csr_matrix, system: System
 ) -> Iterator[tuple[tuple, scipy.sparse.csc_matrix]]:
-    """The diagonal block of each component of a symmetric matrix, and a key that equal blocks share."""
+    """Yields for each component of a symmetric matrix a key, which equal blocks share, and its diagonal block."""
     rows, start = system.rows.cpu().numpy(), system.start.cpu().numpy()
     local = np.empty(len(rows), np.int32)
     local[rows] = np.arange(len(rows)) - np.repeat(start[:-1], np.diff(start))
@@ -146,7 +148,7 @@ def component_blocks(
 
 
 def _factored(block: scipy.sparse.csc_matrix, explicit: bool, budget: int, device: torch.device) -> tuple | None:
-    """Order, pivots, L or W by columns, and W by rows; None where it doesn't fit or can't be trusted."""
+    """Order, pivots, L or W by columns, and W by rows; None if the factor does not fit or cannot be trusted."""
     count = block.shape[0]
     if block.nnz > budget:
         return None
@@ -196,7 +198,7 @@ def _in_panels(lower: scipy.sparse.csc_matrix) -> tuple[np.ndarray, tuple[np.nda
 def _inverted(
     matrix: scipy.sparse.csr_matrix, lower: scipy.sparse.csc_matrix, budget: int, device: torch.device
 ) -> scipy.sparse.csc_matrix | None:
-    """W = L⁻¹ without its diagonal, by columns; None where its two copies don't fit in the budget."""
+    """W = L⁻¹ without its diagonal, by columns; None if its two copies do not fit in the budget."""
     count = matrix.shape[0]
     parent, depth = np.full(count, -1, np.int32), np.zeros(count, np.int32)
     arrays: list[wp.array] = [
@@ -228,7 +230,10 @@ def elimination_tree(
     parent: wp.array[wp.int32],
     depth: wp.array[wp.int32],
 ):
-    """The tree of a symmetric matrix, and how many ancestors each row has; one thread. `ancestor` begins as -1."""
+    """The elimination tree of a symmetric matrix, and the number of ancestors of each row; one thread.
+
+    `ancestor` must be filled with -1 before the launch.
+    """
     count = row_pointer.shape[0] - 1
     for k in range(count):
         for e in range(row_pointer[k], row_pointer[k + 1]):
@@ -258,7 +263,7 @@ def invert_columns(
     inverse_row: wp.array[wp.int32],
     inverse_value: wp.array[wp.float64],
 ):
-    """Column j of W below the diagonal: L w = e_j, from j up to the root. `inverse_value` begins as zero."""
+    """Column j of W below the diagonal: L w = e_j, from j up to the root. `inverse_value` must be zero before."""
     j = wp.tid()
     base = inverse_pointer[j] + depth[j] - 1
     a = j

@@ -1,4 +1,4 @@
-"""What a solver reports of its solves, and the warning when one did not converge."""
+"""Numbers of iterations and errors that a solver reports, and the warning when a solve did not converge."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import torch
 
 
 class Progress:
-    """What the last solve of a solver reported. Reading it on a GPU waits for the solve."""
+    """The report of a solver's last solve. Reading it on a GPU waits for the solve.
+
+    Args:
+        what: Name of the solver, for the warning.
+    """
 
     def __init__(self, what: str) -> None:
         self.what = what
@@ -17,7 +21,14 @@ class Progress:
         self._warned = False
 
     def record(self, report: torch.Tensor, error: torch.Tensor, limit: int, *, add: bool = False) -> None:
-        """Keeps a report, beside the earlier ones if `add`; on the CPU it is looked at straight away."""
+        """Keeps the report of a solve; on the CPU it is checked immediately.
+
+        Args:
+            report: Number of iterations of each component, int32 [C]; negative where the limit ended them.
+            error: Estimated error of each component in the energy norm [m], float64 [C].
+            limit: Limit of iterations, for the warning.
+            add: Whether earlier reports are kept beside this one.
+        """
         self._solves = [*(self._solves if add else []), (report, error)]
         self._limit = limit
         if report.device.type == "cpu":
@@ -31,9 +42,9 @@ class Progress:
         return sum(int(report.abs().max()) for report, _ in self._solves if len(report))
 
     def summary(self) -> torch.Tensor:
-        """`iterations`, components stopped by the limit, their largest error [m]; float64 [3] on the device.
+        """`iterations`, number of components stopped by the limit, their largest error [m]; float64 [3] on the device.
 
-        Does not wait for the solve: hand it to `tell` once it has been read.
+        Does not wait for the solve. Once the numbers have been read from the device, pass them to `warn_if_stopped`.
         """
         reports, errors = (torch.stack(tensors) for tensors in zip(*self._solves, strict=True))
         if not reports.shape[1]:
@@ -42,8 +53,14 @@ class Progress:
         iterations = reports.abs().amax(1).sum()
         return torch.stack([iterations.double(), stopped.sum().double(), torch.where(stopped, errors, 0.0).max()])
 
-    def tell(self, stopped: float, components: int, error: float) -> None:
-        """Warns, once, if components were stopped by the limit."""
+    def warn_if_stopped(self, stopped: float, components: int, error: float) -> None:
+        """Warns, once, if components were stopped by the limit.
+
+        Args:
+            stopped: Number of components that were stopped.
+            components: Number of all components.
+            error: Largest error of those that were stopped, in the energy norm [m].
+        """
         if self._warned or not stopped:
             return
         self._warned = True
@@ -58,4 +75,4 @@ class Progress:
     def _warn(self, report: torch.Tensor, error: torch.Tensor) -> None:
         stopped = report < 0
         if not self._warned and bool(stopped.any()):
-            self.tell(int(stopped.sum()), len(report), float(error[stopped].max()))
+            self.warn_if_stopped(int(stopped.sum()), len(report), float(error[stopped].max()))

@@ -12,7 +12,7 @@ import warp as wp
 
 @wp.func
 def block_sum(value: wp.float64) -> wp.float64:
-    """Sum over the lanes of a block, handed to all; also a barrier: what was written before is visible after."""
+    """Sum over the lanes of a block, returned to each lane. It is also a barrier: earlier writes are visible after."""
     return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
 
 
@@ -26,13 +26,22 @@ class System(NamedTuple):
     row_pointer: torch.Tensor
     column: torch.Tensor
     value: torch.Tensor
+    """The matrix [V,V] in CSR form: int32 [V+1], int32 [N] and float64 [N] for N entries."""
     diagonal: torch.Tensor
+    """float64 [V], diagonal of the matrix."""
 
     @classmethod
     def build(
         cls, matrix: scipy.sparse.csr_matrix, vertex_component: np.ndarray, count: int, device: torch.device
     ) -> System:
-        """Moves a host matrix [V,V] to the device. No entry may join two components."""
+        """Moves a host matrix to the device.
+
+        Args:
+            matrix: Float64 [V,V]. No entry may join two components.
+            vertex_component: Component of each vertex, [V], within [0, count).
+            count: Number of components C.
+            device: Device of the tensors.
+        """
         matrix = matrix.tocsr()
         rows = np.argsort(vertex_component, kind="stable").astype(np.int32)
         start = np.searchsorted(vertex_component[rows], np.arange(count + 1)).astype(np.int32)
@@ -41,7 +50,13 @@ class System(NamedTuple):
 
 
 def block_dim(device: torch.device, vertices: int, count: int) -> int:
-    """Lanes of a block: the CPU has one; a GPU takes more for large components than for small ones."""
+    """Number of lanes of a block: one on the CPU; on a GPU more for large components than for small ones.
+
+    Args:
+        device: Device of the launch.
+        vertices: Number of vertices of all components.
+        count: Number of components.
+    """
     if device.type == "cpu":
         return 256 if wp.config.enable_cpu_blocks else 1
     mean = vertices / max(count, 1)

@@ -1,17 +1,17 @@
 """A x = b for every component that has a factor (factor.py), with three right-hand sides at once.
 
-By substitution, a component per thread, four places at a time, as a CPU likes it:
+By substitution, with a component per thread and four places at a time, which suits a CPU:
 
     for k upwards:      x_k = b_k - Σ_{j<k} L_kj x_j,    for k downwards:  x_k = x_k / D_k - Σ_{j>k} L_jk x_j
 
-or by two sparse products, x = Wᵀ D⁻¹ W b, a row per block of lanes, as a GPU likes it. Work vectors are in elimination
-order, with a fourth number that is zero, since four doubles fit a vector register and three don't.
+or by two sparse products, x = Wᵀ D⁻¹ W b, with a row per block of lanes, which suits a GPU. Work vectors are in
+elimination order and have a fourth number that is zero, since four doubles fill a vector register and three do not.
 
 | symbol | code | what |
 | --- | --- | --- |
-| b, x | `rhs, solution` | [V,3], float64 |
-| `start, rows` | as in System | vertices sorted by component |
-| the rest | as in factor.Factor | |
+| b, x | `rhs, solution` | right-hand side and solution, [V,3], float64 |
+| | `start, rows` | as in system.System: vertices sorted by component |
+| | all other arrays | as in factor.Factor |
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .factor import Factor
 from .system import System, block_dim, block_sum
 
 LANES = 32
-"""Lanes that share a row on a GPU."""
+"""Number of lanes that share a row on a GPU."""
 
 
 @wp.func
@@ -122,7 +122,7 @@ def substitute(
     # Out:
     solution: wp.array[wp.vec3d],
 ):
-    """A component per thread; those without a factor are left as they are."""
+    """One component per thread; rows of components without a factor are not changed."""
     component = wp.tid()
     b = base[component]
     if b >= 0:
@@ -163,7 +163,7 @@ def multiply_lower(
     # Out:
     x: wp.array[wp.vec3d],
 ):
-    """x = D⁻¹ W b, in elimination order, a place per block."""
+    """x = D⁻¹ W b, in elimination order, one place per block."""
     place, lane = wp.tid()
     component = vertex_component[rows[place]]
     b = base[component]
@@ -196,7 +196,7 @@ def multiply_upper(
     # Out:
     solution: wp.array[wp.vec3d],
 ):
-    """Wᵀ x, a place per block; components without a factor are left as they are."""
+    """Wᵀ x, one place per block; rows of components without a factor are not changed."""
     place, lane = wp.tid()
     component = vertex_component[rows[place]]
     b = base[component]
@@ -220,14 +220,14 @@ def solve(
     rhs: torch.Tensor,
     solution: torch.Tensor,
 ) -> None:
-    """Writes x of the components that have a factor.
+    """Writes the solution x in the rows of those components that have a factor.
 
     Args:
-        system: Which vertices belong to a component.
-        factor: Their factors.
-        vertex_component: int32 [V].
-        rhs: b, float64 [V,3].
-        solution: x, float64 [V,3]; rows of other components are not touched.
+        system: System that assigns the vertices to components.
+        factor: Factors of the components.
+        vertex_component: Component of each vertex, int32 [V].
+        rhs: Right-hand side b, float64 [V,3].
+        solution: Output x, float64 [V,3]; rows of components without a factor are not changed.
     """
     if len(rhs) == 0 or not factor.factored:
         return
@@ -258,7 +258,7 @@ def solve(
 
 
 def substitution(factor: Factor) -> list[object]:
-    """A factor in the form for substitution as launch arguments, `base` to `value` of `substitute`."""
+    """Launch arguments `base` to `value` of `substitute` from a factor in the form for substitution."""
     integers = [as_argument(t, wp.int32) for t in (factor.base, factor.first, factor.order)]
     return [
         *integers,

@@ -5,8 +5,8 @@ Supplement sections 1.3 and 2. With e_k the edge of a triangle opposite to corne
     w_k = ½ cot θ_k = -e_i·e_j / (4 A)        (i, j the other two corners)
     L   = Σ_triangles Σ_k w_k (δ_i - δ_j)(δ_i - δ_j)ᵀ
 
-L is symmetric and positive semi-definite (obtuse triangles give negative weights, never negative energy), has no unit,
-and its null space holds one constant per connected component.
+L is symmetric and positive semi-definite (obtuse triangles give negative weights, never negative energy) and has no
+unit. Its null space consists of the functions that are constant on each connected component.
 
 | symbol | code | what |
 | --- | --- | --- |
@@ -27,7 +27,17 @@ SMALLEST_AREA = 1e-10
 
 
 def as_numpy(name: str, array: object, dtype: type) -> np.ndarray:
-    """A host copy of a torch tensor or array-like of shape [*,3]."""
+    """A host copy of an array of shape [*,3].
+
+    Args:
+        name: Name of the argument, for error messages.
+        array: Torch tensor or array-like.
+        dtype: NumPy type of the copy; its kind, integer or float, must be that of the array.
+
+    Raises:
+        ValueError: The array has another shape.
+        TypeError: The array holds numbers of another kind.
+    """
     host = array.detach().cpu().numpy() if isinstance(array, torch.Tensor) else np.asarray(array)
     if host.ndim != 2 or host.shape[1] != 3:
         raise ValueError(f"{name} must have shape [*, 3], got {list(host.shape)}")
@@ -45,7 +55,7 @@ def half_cotangents(rest_vertices: object, faces: object) -> np.ndarray:
         faces: Vertex indices, shape [F,3].
 
     Returns:
-        float64 [F,3], unitless.
+        float64 [F,3], without unit; column k belongs to corner k.
 
     Raises:
         ValueError: Wrong shape, an index out of range, a rest position that is not finite, or faces without area.
@@ -67,17 +77,17 @@ def half_cotangents(rest_vertices: object, faces: object) -> np.ndarray:
 
 
 def cotangent_laplacian(rest_vertices: Sized, faces: object) -> scipy.sparse.csr_matrix:
-    """The positive semi-definite cotangent Laplacian, weights ½ (cot α + cot β).
+    """The positive semi-definite cotangent Laplacian with weights ½ (cot α + cot β).
 
     Args:
         rest_vertices: Rest positions [m], shape [V,3].
         faces: Vertex indices, shape [F,3].
 
     Returns:
-        float64 CSR matrix [V,V] with sorted indices; rows of isolated vertices are empty.
+        float64 CSR matrix [V,V], without unit, with sorted indices; rows of isolated vertices are empty.
 
     Raises:
-        ValueError, TypeError: As `half_cotangents`.
+        ValueError, TypeError: As in `half_cotangents`.
     """
     weights, faces = half_cotangents(rest_vertices, faces), as_numpy("faces", faces, np.int64)
     i, j, w = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel(), weights.ravel()
@@ -96,7 +106,7 @@ def components(vertex_count: int, faces: object) -> tuple[np.ndarray, np.ndarray
         faces: Vertex indices, shape [F,3].
 
     Returns:
-        Component of each vertex int32 [V], of each face int32 [F], and their number.
+        Component of each vertex, int32 [V]; component of each face, int32 [F]; number of components.
     """
     faces = as_numpy("faces", faces, np.int64)
     rows, columns = faces.ravel(), np.roll(faces, 1, axis=1).ravel()

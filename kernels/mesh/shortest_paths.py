@@ -1,22 +1,22 @@
 """Shortest paths from many nodes of a graph, 32 sources at a time: one scalar search, then vector sweeps.
 
-Lengths are counted in whole units, so small that nothing is lost, so that sums are exact: the result depends neither
-on the order of additions nor on which sources share a block, and the distance there is the distance back.
+Lengths are integers, multiples of a unit so small that the rounding does not matter. Sums are therefore exact: the
+result depends neither on the order of additions nor on which sources share a block, and distances are symmetric.
 
 1. Dijkstra's algorithm (1959) from one source of a block lists all nodes by their distance from it.
-2. Sources of a block are neighbours, so this order nearly suits all of them. In this order, for all of them at once,
+2. The sources of a block are neighbours, so this order nearly suits all of them. In this order, for all at once,
 
        d_v = min(d_v, min_u d_u + w_uv)        d_v [32], one entry per source
 
-   (Bellman 1958). A second pass looks at every node again; later ones only at neighbours of what changed.
-   When nothing does, d is the fixed point: the shortest paths.
+   (Bellman 1958). A second pass visits every node again; later passes visit only neighbours of nodes that changed.
+   When no node changes, d is the fixed point: the lengths of the shortest paths.
 
-On a garment's graph of some 125 edges a node, a node is looked at 2.0 to 2.2 times.
+On a garment's graph of some 125 edges a node, a node is visited 2.0 to 2.2 times.
 
 | symbol | code | what |
 | --- | --- | --- |
-| w_uv | `pointer, column, length` | CSR, symmetric, int64 units |
-| d_v | `distance` | [N], 32 int64 units each; `FAR`: not reached |
+| w_uv | `pointer, column, length` | edge lengths, CSR, symmetric, int64, in units |
+| d_v | `distance` | [N], 32 int64 each, in units; `FAR` where a source does not reach the node |
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from scipy.sparse.csgraph import dijkstra
 wp.set_module_options({"enable_backward": False})
 
 LANES = 32
-LANDMARKS = 6  # nodes that others are placed by
+LANDMARKS = 6  # the distances to these nodes serve as coordinates of all nodes
 _LANES = wp.constant(LANES)
-FAR = wp.constant(wp.int64(2**61))  # more than any path, and it can be added to one
+FAR = wp.constant(wp.int64(2**61))  # longer than any path; the sum of it and a path does not overflow
 row = wp.types.vector(LANES, wp.int64)
 
 
 @wp.func
 def rise(hole: int, node: int, heap: wp.array[wp.int32], place: wp.array[wp.int32], near: wp.array[wp.int64]):
-    """Puts a node into the heap at a hole, or above it."""
+    """Inserts a node into the heap at a hole, or above it."""
     at = hole
     key = near[node]
     going = at
@@ -61,7 +61,7 @@ def rise(hole: int, node: int, heap: wp.array[wp.int32], place: wp.array[wp.int3
 
 @wp.func
 def remove_top(size: int, heap: wp.array[wp.int32], place: wp.array[wp.int32], near: wp.array[wp.int64]):
-    """Closes the gap at the top of a heap that had one node more, the last one at `size`."""
+    """Fills the top of a heap, whose node was removed, with the last node, which lies at index `size`."""
     last = heap[size]
     key = near[last]
     at = wp.int32(0)
@@ -96,7 +96,7 @@ def order_from(
     near: wp.array[wp.int64],
     order: wp.array[wp.int32],
 ):
-    """Lists nodes by distance from `first`, as far as the limit around the sources met; returns how many in all."""
+    """Lists nodes by distance from `first`, up to the limit around all sources; returns the number listed in all."""
     near[first] = wp.int64(0)
     heap[0] = first
     place[first] = 0
@@ -156,7 +156,7 @@ def search(
     # Out:
     found: wp.array2d[wp.float32],
 ):
-    """Distances from a block of sources to the targets; `inf` beyond the limit. One thread."""
+    """Distances from a block of sources to the targets; `inf` beyond the limit. Runs in one thread."""
     for v in range(near.shape[0]):
         near[v] = FAR
         place[v] = -1
@@ -208,7 +208,14 @@ def search(
 
 
 def unit_of(graph: csr_matrix) -> float:
-    """A power of two so small that 2^60 of it are more than any path; ValueError if a length is none."""
+    """Unit of length for a graph: a power of two, so small that no path is longer than 2^60 units.
+
+    Args:
+        graph: Lengths of edges, [N,N], in any unit.
+
+    Raises:
+        ValueError: A length is negative or not finite.
+    """
     longest = float(graph.data.max(initial=0.0))
     if not (longest < np.inf and graph.data.min(initial=0.0) >= 0.0):
         raise ValueError("lengths of edges must be finite and not negative")
@@ -216,22 +223,23 @@ def unit_of(graph: csr_matrix) -> float:
 
 
 class Paths:
-    """A graph made ready for searches on the CPU.
+    """A graph prepared for searches on the CPU.
 
     Args:
-        graph: Lengths of edges, [N,N], symmetric, not negative, any unit.
-        targets: Nodes that distances are wanted to, [T].
-        unit: What lengths are rounded to, see `unit_of`; None: that of this graph. Parts of a graph take the whole's.
+        graph: Lengths of edges, [N,N], symmetric, not negative, in any unit.
+        targets: Nodes to which distances are computed, integers [T].
+        unit: Unit to whose multiples lengths are rounded; None takes `unit_of` of this graph. Parts of a graph must
+            be given the unit of the whole graph.
 
     Raises:
-        ValueError: A length that is negative or not finite, if no unit is given.
+        ValueError: A length is negative or not finite, and no unit is given.
     """
 
     def __init__(self, graph: csr_matrix, targets: np.ndarray, unit: float | None = None):
         self.unit = unit_of(graph) if unit is None else unit
         self.count = graph.shape[0]
         self._landmarks = _landmarks(graph)
-        order = np.concatenate(list(neighbourhoods(self._landmarks, LANES)))  # neighbours lie close in memory
+        order = np.concatenate(list(neighbourhoods(self._landmarks, LANES)))  # so that neighbours lie close in memory
         self.place = np.empty(self.count, np.int32)  # new number of each node
         self.place[order] = np.arange(self.count, dtype=np.int32)
         graph = graph[order][:, order]
@@ -244,24 +252,27 @@ class Paths:
         self._target_count = len(targets)
 
     def distances(self, sources: np.ndarray, limit: float = np.inf, threads: int | None = None) -> np.ndarray:
-        """Lengths of the shortest paths, float32 [S,T]; `inf` where there is none, or none within the limit.
+        """Lengths of the shortest paths from sources to the targets.
 
         Args:
-            sources: Nodes to start from, [S].
-            limit: Longest path of interest.
-            threads: Of the host; None: one for each core. Each takes some 330 bytes a node.
+            sources: Nodes from which paths start, integers [S].
+            limit: Longest path of interest, in the graph's unit of length.
+            threads: Number of host threads; None takes one for each core. A thread needs some 330 bytes a node.
+
+        Returns:
+            float32 [S,T], in the graph's unit of length; `inf` where no path exists within the limit.
         """
         place, points = self.place[sources], self._landmarks[sources]
-        found = np.empty((len(sources), self._target_count), np.float32)
+        lengths = np.empty((len(sources), self._target_count), np.float32)
         blocks = list(neighbourhoods(points, LANES))
         whole = wp.int64(int(min(limit / self.unit, 2.0**61)))
-        mine = threading.local()
+        of_thread = threading.local()
 
         def run(block: np.ndarray) -> None:
-            if not hasattr(mine, "work"):
+            if not hasattr(of_thread, "work"):
                 kinds = wp.int32, wp.int32, wp.int64, wp.int32, wp.int8, row
-                mine.work = [wp.empty(self.count, dtype=kind, device="cpu") for kind in kinds]
-                mine.found = np.empty((LANES, self._target_count), np.float32)
+                of_thread.work = [wp.empty(self.count, dtype=kind, device="cpu") for kind in kinds]
+                of_thread.lengths = np.empty((LANES, self._target_count), np.float32)
             middle = np.argmin(((points[block] - points[block].mean(axis=0)) ** 2).sum(axis=1))
             block = np.roll(block, -middle)  # the order of nodes is that of the first source
             padded = np.concatenate([place[block], np.repeat(place[block[:1]], LANES - len(block))])
@@ -274,23 +285,30 @@ class Paths:
                     len(block),
                     whole,
                     self.unit,
-                    *mine.work,
+                    *of_thread.work,
                 ],
-                outputs=[wp.array(mine.found, dtype=wp.float32, device="cpu", copy=False)],
+                outputs=[wp.array(of_thread.lengths, dtype=wp.float32, device="cpu", copy=False)],
                 device="cpu",
             )
-            found[block] = mine.found[: len(block)]
+            lengths[block] = of_thread.lengths[: len(block)]
 
-        for block in blocks[:1]:  # alone: it may have to compile the kernel
+        for block in blocks[:1]:  # before the others, since it may have to compile the kernel
             run(block)
-        with ThreadPoolExecutor(threads or usable_cores()) as pool:  # launches release the interpreter's lock
+        with ThreadPoolExecutor(threads or usable_cores()) as pool:  # launches release the global interpreter lock
             list(pool.map(run, blocks[1:]))
-        return found
+        return lengths
 
 
 def neighbourhoods(points: np.ndarray, size: int) -> Iterator[np.ndarray]:
-    """Indices of points [N,D] in blocks of neighbours of a given size, the last one smaller, by dividing along the
-    longest side of the bounding box."""
+    """Divides points into blocks of neighbours, along the longest side of the bounding box.
+
+    Args:
+        points: Coordinates, [N,D].
+        size: Number of points in a block; the last block may be smaller.
+
+    Yields:
+        Indices of the points of a block.
+    """
     waiting = [np.arange(len(points))]
     while waiting:
         block = waiting.pop()
@@ -304,19 +322,19 @@ def neighbourhoods(points: np.ndarray, size: int) -> Iterator[np.ndarray]:
 
 
 def _landmarks(graph: csr_matrix) -> np.ndarray:
-    """Distances to some nodes far from each other, [N,LANDMARKS]: places of nodes as the graph alone knows them."""
+    """Distances to some nodes far from each other, [N,LANDMARKS]: coordinates of nodes from the graph alone."""
     away = dijkstra(graph, indices=0)
-    found: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
     nearest = np.full(graph.shape[0], np.inf)
     for _ in range(LANDMARKS):
-        away = dijkstra(graph, indices=int(away.argmax() if not found else nearest.argmax()))
+        away = dijkstra(graph, indices=int(away.argmax() if not columns else nearest.argmax()))
         nearest = np.minimum(nearest, away)
-        found.append(away)
-    points = np.stack(found, axis=1)
+        columns.append(away)
+    points = np.stack(columns, axis=1)
     finite = np.isfinite(points)
     return np.where(finite, points, 2.0 * points[finite].max())
 
 
 def usable_cores() -> int:
-    """Cores this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

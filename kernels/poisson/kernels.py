@@ -8,7 +8,7 @@ from warpgarment.kernels.linear.system import block_sum
 
 FREE = wp.constant(0)  # translation from `mean`
 PINNED = wp.constant(1)  # translation from the pins
-ISOLATED = wp.constant(2)  # a vertex without faces or pin: stays where it is
+ISOLATED = wp.constant(2)  # a vertex without faces or pin, which is not moved
 
 
 @wp.func
@@ -33,7 +33,7 @@ def right_hand_side(
     # Out:
     rhs: wp.array[wp.vec3d],
 ):
-    """g of solver.py, gathered by each vertex from its corners, in a fixed order."""
+    """The right-hand side g of solver.py, gathered by each vertex from its corners in a fixed order."""
     a = wp.tid()
     v = initial[a]
     g = wp.vec3d()
@@ -102,7 +102,7 @@ def place_adjoint(
     rhs: wp.array[wp.vec3d],
     grad_mean: wp.array[wp.vec3],
 ):
-    """The transpose of `place`: what reaches the increment and the mean."""
+    """The transpose of `place`: gradients with respect to the increment and the mean."""
     component, lane = wp.tid()
     stride = wp.block_dim()
     total = wp.vec3d()
@@ -136,7 +136,7 @@ def phi_adjoint(
     # Out:
     grad_phi: wp.array3d[wp.float32],
 ):
-    """∂/∂Φ_i = Σ_edges w (λ_a - λ_b)(X_a - X_b)ᵀ, λ the adjoint solution."""
+    """∂/∂Φ_i = Σ_edges w (λ_a - λ_b)(X_a - X_b)ᵀ, where λ is the adjoint solution."""
     i = wp.tid()
     g = wp.mat33d()
     for k in range(3):

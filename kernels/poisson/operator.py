@@ -18,8 +18,7 @@ from .kernels import phi_adjoint, place, place_adjoint, right_hand_side
 ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
 
-# The tensors of a solver travel through the operators as one list, in this order; System and Factor follow.
-# The tensors of a solver travel through the operators as one list, in this order; `Matrix` follows.
+# The tensors of a solver are passed to the operators as one list, in this order, followed by those of `Matrix`.
 MODEL = (
     ("rest_vertices", wp.vec3),
     ("faces", wp.int32),
@@ -59,8 +58,10 @@ def _start_rows(model: list[torch.Tensor]) -> list[object]:
 def _solve(
     model: list[torch.Tensor], rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(L + W) D = g: directly where there is a factor, or else as `conjugate_gradients.solve`, which says what is
-    returned."""
+    """Solves (L + W) D = g: directly where there is a factor, otherwise by conjugate gradients.
+
+    Returns as `conjugate_gradients.solve` does: D [m], float64 [V,3], iterations and error of each component.
+    """
     system, factor = matrix_of(model)
     tensors = _named(model)
     if factor.unfactored:
@@ -80,7 +81,7 @@ def _named(model: list[torch.Tensor]) -> dict[str, torch.Tensor]:
 
 
 def matrix_of(model: list[torch.Tensor]) -> Matrix:
-    """The matrix among the tensors of a solver."""
+    """The matrix, taken from the tensors of a solver."""
     return unpack(model[len(MODEL) :], Matrix)
 
 
@@ -93,11 +94,23 @@ def poisson_solve(
     model: list[torch.Tensor],
     max_iterations: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The solve on tensors alone; see `PoissonSolver.solve`. Returns vertices, iterations and error per component."""
+    """The solve as an operator on tensors alone; see `PoissonSolver.solve` for the first four arguments.
+
+    Args:
+        phi: Deformation gradients, float32 [F,3,3].
+        mean: Wanted mean of the face centroids of each component [m], float32 [C,3].
+        pin_target: Positions of the pins [m], float32 [P,3].
+        initial: Guess of the positions [m], float32 [V,3].
+        model: Tensors of the solver, in the order of `MODEL`, followed by those of `Matrix`.
+        max_iterations: Limit of conjugate gradients per component.
+
+    Returns:
+        Positions [m], float32 [V,3]; iterations, int32 [C]; estimated error in the energy norm [m], float64 [C].
+    """
     tensors, m, count = _named(model), _views(model), len(mean)
     phi, mean, pin_target = phi.contiguous(), mean.contiguous(), pin_target.contiguous()
     guess = initial.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
-    if len(pin_target):  # the translation of a pinned component that its pins agree on
+    if len(pin_target):  # a pinned component starts with the mean translation of its pins
         pins = tensors["pins"]
         offset = torch.zeros((count, 3), dtype=torch.float64, device=phi.device)
         offset.index_add_(0, tensors["vertex_component"][pins], pin_target.double() - guess[pins])

@@ -1,6 +1,6 @@
 """From deformation gradients back to vertices: the Poisson solve, once per frame and component.
 
-Supplement section 1.3, eq. 1, its in-plane part (the part along the normal says nothing about positions):
+Supplement section 1.3, eq. 1, its in-plane part (the part along the normal does not depend on positions):
 
     V* = argmin_V Σ_i s_i ‖(Φ_i(V) - Φ_i) P_i‖²,    P_i = I - n_i n_iᵀ of the rest triangle
 
@@ -15,12 +15,12 @@ translation of a component free: it follows from the pins W, or else from `mean`
 | symbol | code | what |
 | --- | --- | --- |
 | Φ_i | `phi` | deformation gradient of face i, [3,3] |
-| X | `rest_vertices` | rest positions |
-| V⁰, D | `initial`, `increment` | guess and what is solved for |
+| X | `rest_vertices` | rest positions [m] |
+| V⁰, D | `initial`, `increment` | guess, and the unknown increment [m] |
 | w | `half_cotangent` | ½ cot of the angle opposite to an edge |
 | L | `laplacian.cotangent_laplacian` | [V,V] |
-| W, t | `pin_stiffness, pin_target` | soft constraints |
-| z | `mean` | mean of the face centroids, one per component (section 4.2) |
+| W, t | `pin_stiffness, pin_target` | soft constraints: stiffness, and target [m] |
+| z | `mean` | mean of the face centroids [m], one per component (section 4.2) |
 
 The matrix is constant, so it is factored once (linear/factor.py) and every solve is direct (linear/triangular.py);
 components without a factor are solved by conjugate gradients (linear/conjugate_gradients.py). The operator is linear
@@ -62,15 +62,18 @@ class PoissonSolver:
         faces: Vertex indices, int32 [F,3].
         pins: Vertices held by soft constraints, integers [P], no vertex twice.
         pin_weight: Stiffness of a pin, in units of the mean diagonal entry of the Laplacian.
-        tolerance: Where conjugate gradients stop: error in the energy norm as a share of the component's rest bounding
-            box diagonal. The default keeps every vertex within 1e-5 of that diagonal of the direct solution.
+        tolerance: Error in the energy norm at which conjugate gradients stop, as a share of the diagonal of the
+            component's rest bounding box. The default keeps every vertex within 1e-5 of that diagonal of the direct
+            solution.
         max_iterations: Limit of conjugate gradients per solve; reaching it warns once.
-        factor_budget: Entries of all factors together, 12 bytes each. Components that don't fit are solved by
-            conjugate gradients; with zero all are.
-        explicit: Whether factors are inverted, so that all rows of a solution are found at once; None: on a GPU.
+        factor_budget: Limit of the entries of all factors together, 12 bytes each. Components whose factor does not
+            fit are solved by conjugate gradients; with zero, all components are.
+        explicit: Whether factors are inverted, so that all rows of a solution are computed at once; None means that
+            they are inverted on a GPU only.
 
     Raises:
-        ValueError: Wrong shapes, indices out of range, a pin twice, rest faces without area, options not positive.
+        ValueError: Wrong shapes, indices out of range, a pin given twice, rest faces without area, or options that are
+            not positive.
         TypeError: Wrong dtypes.
     """
 
@@ -153,12 +156,20 @@ class PoissonSolver:
         return self._progress.iterations
 
     def summary(self) -> torch.Tensor:
-        """What the last solve says: iterations, components stopped by the limit, their largest error; not read."""
+        """Report of the last solve: iterations, number of components stopped by the limit, their largest error [m].
+
+        float64 [3] on the solver's device; does not wait for the solve.
+        """
         return self._progress.summary()
 
-    def tell(self, stopped: float, error: float) -> None:
-        """Warns, once, if a summary that was read from the device says that components were stopped."""
-        self._progress.tell(stopped, self.component_count, error)
+    def warn_if_stopped(self, stopped: float, error: float) -> None:
+        """Warns, once, if components were stopped by the limit.
+
+        Args:
+            stopped: Number of components that were stopped, from a `summary` that was read from the device.
+            error: Largest error of those components [m], from that summary.
+        """
+        self._progress.warn_if_stopped(stopped, self.component_count, error)
 
     def solve(
         self,
@@ -174,9 +185,9 @@ class PoissonSolver:
             phi: Deformation gradients with respect to the rest mesh, float32 [F,3,3].
             mean: Wanted mean of the face centroids of each component [m], float32 [C,3]; not read for a component
                 with pins or a vertex without faces.
-            initial: A guess [m], the closer the faster, float32 [V,3]; the rest positions when None. The solution does
-                not depend on it, except that vertices without faces or pin keep it.
-            pin_targets: Where the pins are drawn to [m], float32 [P,3]; required when there are pins.
+            initial: Guess of the positions [m], float32 [V,3], or None for the rest positions. A closer guess makes
+                the solve faster. The solution does not depend on it, except that vertices without faces or pin keep it.
+            pin_targets: Positions to which the pins are drawn [m], float32 [P,3]; required if there are pins.
 
         Returns:
             Positions [m], float32 [V,3].
@@ -204,7 +215,7 @@ class PoissonSolver:
 
 
 def _corner_edges(vertices: np.ndarray, faces: np.ndarray, cotangents: np.ndarray) -> np.ndarray:
-    """Σ w (X_a - X_b) over the two edges at each corner a, [3F,3]: what Φ multiplies in g."""
+    """Σ w (X_a - X_b) over the two edges at each corner a, [3F,3], which Φ multiplies in g."""
     corner, edges = vertices[faces], np.zeros((len(faces), 3, 3))
     for step in (1, 2):  # from corner k to k + step, opposite to k + 3 - step
         edges += np.roll(cotangents, step, axis=1)[:, :, None] * (corner - np.roll(corner, -step, axis=1))
@@ -212,10 +223,10 @@ def _corner_edges(vertices: np.ndarray, faces: np.ndarray, cotangents: np.ndarra
 
 
 def _ground(matrix: scipy.sparse.csr_matrix, vertex_component: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """What makes a free component's matrix definite: a stiffness at its first vertex, [V].
+    """A stiffness at the first vertex of each free component, which makes its matrix definite, float64 [V].
 
-    The right-hand side of a free component sums to zero, so that the first vertex stays at zero and the other
-    equations are unchanged.
+    The right-hand side of a free component sums to zero, so that the increment of the first vertex is zero and the
+    other equations are unchanged.
     """
     largest = np.zeros(len(kind))
     np.maximum.at(largest, vertex_component, matrix.diagonal())

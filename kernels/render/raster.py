@@ -1,8 +1,8 @@
-"""Triangles into a depth buffer.
+"""Rasterisation of triangles into a depth buffer.
 
 A view is a perspective camera or an orthographic one (a light, for its shadows). A pixel keeps its nearest triangle
 in one 64-bit word, closeness in the upper half and face index plus one in the lower, so that a single atomic maximum
-decides and the result does not depend on the order of threads. 0 stands for nothing.
+decides and the result does not depend on the order of threads. The word of an empty pixel is 0.
 
     closeness   perspective 1/z, orthographic z_far - z: both are affine in screen space and grow towards the eye
 """
@@ -17,12 +17,15 @@ from warpgarment.kernels import launch  # noqa: F401  (quietens Warp)
 
 wp.set_module_options({"enable_backward": False})
 
-_FAR = wp.constant(100.0)  # an orthographic view sees this far [m]
+_FAR = wp.constant(100.0)  # depth of an orthographic view [m]
 
 
 @wp.struct
 class View:
-    """An eye and its picture plane. `scale` is the focal length (perspective) or the pixels a metre (orthographic)."""
+    """An eye [m] and its picture plane: unit directions to the right, up and forward, and the size in pixels.
+
+    `scale` is the focal length in pixels (perspective) or the number of pixels per metre (orthographic).
+    """
 
     eye: wp.vec3
     right: wp.vec3
@@ -86,7 +89,7 @@ def closeness_of(word: wp.int64) -> float:
 
 @wp.func
 def ray(view: View, x: float, y: float) -> wp.vec3:
-    """From the eye to the picture plane at depth 1."""
+    """The vector from the eye to a pixel of the picture plane at depth 1."""
     u = (x - 0.5 * float(view.width)) / view.scale
     v = (y - 0.5 * float(view.height)) / view.scale
     return view.forward + u * view.right - v * view.up
@@ -131,16 +134,17 @@ def raster_kernel(
 
 
 def rasterise(view: View, vertices: wp.array, faces: wp.array, device: Any = "cpu") -> tuple[wp.array, wp.array]:
-    """Projects and rasterises.
+    """Projects and rasterises triangles.
 
     Args:
-        view: Where from; `width` x `height` is the size of the buffer.
-        vertices: wp.vec3 [V], metres.
-        faces: int32 [F, 3 or more], the first three columns being corners.
+        view: View from which the triangles are seen; `width` x `height` is the size of the buffer in pixels.
+        vertices: Vertex positions [m], wp.vec3 [V].
+        faces: Vertex indices, int32 [F, 3 or more]; the first three columns are the corners.
         device: Warp device of the arrays.
 
     Returns:
-        wp.vec3 [V] of pixel column, pixel row and closeness; int64 [height, width], words as above.
+        Pixel column, pixel row and closeness of each vertex, wp.vec3 [V]; the word of each pixel as described in the
+        module's docstring, int64 [height, width].
     """
     screen = wp.empty(len(vertices), dtype=wp.vec3, device=device)
     buffer = wp.zeros((view.height, view.width), dtype=wp.int64, device=device)

@@ -1,6 +1,7 @@
-"""Light on rasterised triangles: one thread per pixel.
+"""Shading of rasterised triangles, with one thread per pixel.
 
-A warm key light with a soft shadow from its depth buffer, a cool fill light, a sky that darkens in creases, a floor.
+The scene has a warm key light with a soft shadow from its depth buffer, a cool fill light, a sky that darkens in
+creases, and a floor.
 With normal n, key direction l and fill direction f, in linear light:
 
     radiance = colour * (sky(n) * openness + key * lit * max(n.l, 0) + fill * max(n.f, 0)) + rim
@@ -22,7 +23,11 @@ _GOLDEN = wp.constant(2.399963)  # golden angle [rad]: a spiral of taps without 
 
 @wp.struct
 class Stage:
-    """Lights, background and floor, colours in linear light. Directions point towards the light."""
+    """Lights, background and floor.
+
+    Colours are in linear light. `key` and `fill` are unit directions towards the lights; `floor_height`, `floor_fade`,
+    `focus` and `occlusion_radius` are in metres.
+    """
 
     key: wp.vec3
     key_color: wp.vec3
@@ -48,7 +53,7 @@ def vertex_normal_kernel(
     # Out:
     normals_out: wp.array(dtype=wp.vec3),
 ):
-    """Adds each face's area-weighted normal to its corners; the shading pass normalises."""
+    """Adds each face's area-weighted normal to its corners; the shading pass normalises the sums."""
     tid = wp.tid()
     i, j, k = faces[tid, 0], faces[tid, 1], faces[tid, 2]
     n = wp.cross(vertices[j] - vertices[i], vertices[k] - vertices[i])
@@ -83,7 +88,7 @@ def _occlusion(
     p: wp.vec3,
     n: wp.vec3,
 ) -> float:
-    """How open p is, from the depth buffer alone (1: nothing near rises above its tangent plane)."""
+    """Openness of p, from the depth buffer alone; 1 if nothing near p rises above its tangent plane."""
     radius = stage.occlusion_radius
     reach = radius * view.scale * closeness
     blocked = wp.float32(0.0)
@@ -142,7 +147,7 @@ def shade_kernel(
     # Out:
     image_out: wp.array2d(dtype=wp.vec3),
 ):
-    """Linear colour of one pixel. `faces`: three corners and, fourth, whether the back of the face is a lining."""
+    """Linear colour of one pixel. A row of `faces` holds three corners and whether the back of the face is a lining."""
     y, x = wp.tid()
     px, py = float(x) + 0.5, float(y) + 0.5
     face = face_of(buffer[y, x])
@@ -169,8 +174,8 @@ def shade_kernel(
     shadow = wp.float32(0.0)
     if wp.dot(n, stage.key) > -0.15:
         texel = 1.0 / light.scale
-        shadow = _lit(light, shadow_map, p + 3.0 * texel * n, 2.0 * texel)  # off the surface, or it shades itself
-    # wrapped a little past the terminator, as cloth and skin are
+        shadow = _lit(light, shadow_map, p + 3.0 * texel * n, 2.0 * texel)  # off the surface, which would shade p
+    # The key light reaches a little past the terminator, as it does on cloth and skin.
     radiance += stage.key_color * (shadow * wp.max((wp.dot(n, stage.key) + 0.15) / 1.15, 0.0))
     radiance += stage.fill_color * wp.max(wp.dot(n, stage.fill), 0.0)
     grazing = 1.0 - wp.max(wp.dot(n, to_eye), 0.0)
@@ -210,17 +215,17 @@ def render(
     """Draws one picture.
 
     Args:
-        vertices: NumPy float32 [V, 3], metres.
-        faces: NumPy int32 [F, 4], three corners and 1 where the back of the face is a lining, drawn darker.
-        colors: NumPy float32 [V, 3], linear light.
-        view: The camera, `width` and `height` in samples.
-        light: The key light's orthographic view.
-        stage: Lights, backdrop, floor.
-        samples: Samples per pixel and direction; divides `view.width` and `view.height`.
+        vertices: Vertex positions [m], NumPy float32 [V, 3].
+        faces: Three corners, and 1 where the back of the face is a lining, which is drawn darker, NumPy int32 [F, 4].
+        colors: Vertex colours in linear light, NumPy float32 [V, 3].
+        view: The camera, with `width` and `height` in samples.
+        light: Orthographic view of the key light.
+        stage: Lights, backdrop and floor.
+        samples: Number of samples per pixel in each direction, a divisor of `view.width` and `view.height`.
         device: Warp device.
 
     Returns:
-        NumPy uint8 [height / samples, width / samples, 3].
+        sRGB picture, NumPy uint8 [height / samples, width / samples, 3].
     """
     v: wp.array[wp.vec3] = wp.array(vertices, dtype=wp.vec3, device=device)
     c: wp.array[wp.vec3] = wp.array(colors, dtype=wp.vec3, device=device)

@@ -1,8 +1,8 @@
-"""Bodies as Warp meshes: checked, built once, refitted as they move, asked for closest points.
+"""Bodies as Warp meshes: checked, built once, refitted as they move, queried for closest points.
 
-One `wp.Mesh` per body, since a point of one garment must not see another's body. Vertices and faces are packed like
-everything else; the ids of the meshes travel to the kernel as an array that is indexed by the body of each point. The
-kernels that ask are in closest.py.
+There is one `wp.Mesh` per body, since a point of one garment must not see another garment's body. Vertices and faces
+are packed as in all kernels; the ids of the meshes are passed to a kernel as an array that is indexed by the body of
+each point. The kernels of the queries are in closest.py.
 """
 
 from __future__ import annotations
@@ -21,18 +21,20 @@ from .closest import Bodies, query_bodies
 from .inside import loop_size_kernel
 
 LEAF_SIZE = 2
-"""Faces in a leaf of a hierarchy: 1, 2, 4 and 8 take 2.50, 2.33, 2.37 and 2.58 ms for 1,836 points on a CPU."""
+"""Number of faces in a leaf of a hierarchy: 1, 2, 4 and 8 take 2.50, 2.33, 2.37 and 2.58 ms for 1,836 points on a
+CPU."""
 
 
 class BodyQuery(NamedTuple):
-    """Closest points of bodies.
+    """Closest points of bodies, for N points.
 
-    Where nothing was found (the point is not finite, or no face of its body has an area), the numbers are NaN and the
-    face -1.
+    Where there is no closest point (the point is not finite, or no face of its body has an area), the distance and the
+    position are NaN and the face is -1.
     """
 
     distance: torch.Tensor
-    """Signed distance [m], float32 [N]; negative inside. Infinite beyond `within`, with NaN and -1 beside it."""
+    """Signed distance [m], float32 [N]; negative inside. Infinite beyond `within`, where `closest` is NaN and `face`
+    -1."""
     closest: torch.Tensor
     """Nearest surface point [m], float32 [N, 3]."""
     face: torch.Tensor
@@ -40,13 +42,13 @@ class BodyQuery(NamedTuple):
 
 
 class BodyMeshes:
-    """A packed batch of bodies, ready to be asked for closest points.
+    """A packed batch of bodies, prepared for queries of closest points.
 
     Args:
-        vertices: Positions [m], float32 [U, 3]. Copied.
+        vertices: Positions [m], float32 [U, 3]; they are copied.
         faces: Packed (global) vertex indices, int32 [G, 3].
-        vertex_offsets: Where the vertices of each body begin, and the end, [B + 1]. None: one body.
-        face_offsets: The same for faces, [B + 1]. None: one body.
+        vertex_offsets: Index at which the vertices of each body begin, and U, integers [B + 1]; None for one body.
+        face_offsets: Index at which the faces of each body begin, and G, integers [B + 1]; None for one body.
 
     Raises:
         TypeError: Wrong dtypes.
@@ -98,7 +100,7 @@ class BodyMeshes:
         self.mesh_ids = integers([mesh.id for mesh in self._meshes], torch.int64)
         self.face_offsets = integers(face_starts)
         self.model = Bodies()
-        """What kernels get: arrays over the memory of this object, which must outlive their launches."""
+        """Argument of kernels: arrays over the memory of this object, which must outlive their launches."""
         tensors = {
             "meshes": (self.mesh_ids, wp.uint64),
             "face_offsets": (self.face_offsets, wp.int32),
@@ -128,15 +130,15 @@ class BodyMeshes:
 
     @property
     def device(self) -> torch.device:
-        """Where the bodies live."""
+        """Device of the bodies."""
         return self._vertices.device
 
     def update(self, vertices: torch.Tensor) -> None:
         """Moves the bodies: copies the positions and refits the hierarchies (cheaper than building, and as accurate).
 
         Args:
-            vertices: New positions [m], float32 [U, 3]. They are not searched for NaN, which would stall a GPU every
-                frame; faces with such corners are not found by queries, or answer NaN.
+            vertices: New positions [m], float32 [U, 3]. They are not checked for NaN, which would stall a GPU in every
+                frame; queries ignore faces with such corners or return NaN for them.
         """
         expect("body vertices", vertices, tuple(self._vertices.shape), device=self.device)
         self._vertices.copy_(vertices.detach())
@@ -153,7 +155,17 @@ class BodyMeshes:
                 wp.launch(loop_size_kernel, dim=loops, inputs=inputs, outputs=[self.model.loop_size], device=device)
 
     def body_of(self, name: str, body: torch.Tensor | None, rows: int) -> torch.Tensor:
-        """The body of each of `rows` points: as given, after a check, or the only one there is."""
+        """The body of each of several points, int32 [rows].
+
+        Args:
+            name: Name of the argument `body`, for error messages.
+            body: Body of each point, int32 [rows]; None if there is one body.
+            rows: Number of points.
+
+        Raises:
+            TypeError: Wrong dtype.
+            ValueError: Wrong shape or device, or None although there are several bodies.
+        """
         if body is None:
             if self.count != 1:
                 raise ValueError(f"{name} is needed to choose among {self.count} bodies")
@@ -173,8 +185,9 @@ class BodyMeshes:
         Args:
             points: Positions [m], float32 [N, 3].
             body: Body of each point, int32 [N]; None if there is one body.
-            within: Points outside and at least so far [m] from the body are not looked at further, which is many times
-                faster: their distance is infinite. A number, or float32 [N]. Points inside are answered at any depth.
+            within: Distance [m], a number or float32 [N]. For points outside that are at least this far from the body
+                the search stops early and the distance is infinite, which is many times faster. Points inside get an
+                answer at any depth.
         """
         expect("points", points, (None, 3), device=self.device)
         body = self.body_of("body", body, len(points))
@@ -196,7 +209,7 @@ def _offsets(name: str, offsets: torch.Tensor | Sequence[int] | None, total: int
 
 
 def _check(vertices: torch.Tensor, faces: torch.Tensor, starts: list[int], face_starts: list[int]) -> torch.Tensor:
-    """Refuses what `wp.Mesh` must not see. Returns the first vertex of the body of each face, int32 [G]."""
+    """Refuses bodies that `wp.Mesh` must not get. Returns the first vertex of the body of each face, int32 [G]."""
     sizes = [b - a for a, b in pairwise(face_starts)]
     empty = [b for b, size in enumerate(sizes) if size == 0]
     if empty:

@@ -2,9 +2,9 @@
 
 Manifold-aware transformers, section 4.2 (s_i) and supplement equation 2; formulas in query.py. The closest point comes
 from Warp's hierarchy of the body's faces, the sign from inside.py. Nothing of earlier frames is used: a perfect guess
-of the distance would shorten the search by a tenth, and an answer would depend on more than was asked. What shortens
-it is to ask for less: contacts need no point that is further outside than they reach (`within`). Which face is named
-where several are equally near is decided in nearest_face.py.
+of the distance would shorten the search by a tenth only, and a result would then depend on more than its arguments. A
+limit on the distance shortens the search much more (`within`): contacts need no point that is further outside. Which
+face is named where several are equally near is decided in nearest_face.py.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from warpgarment.kernels.operator import allocate
 from .inside import is_inside
 from .nearest_face import named_face, nearest_on_part, nearest_part
 
-MAX_DISTANCE = wp.constant(1.0e18)  # farther than anything; its square still fits a float32
+MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its square is still a finite float32
 # Bodies in pieces: distance, in radii, from which a group of faces is summed as one. On closed bodies 1, 2 and 3 give
 # the same signs (20,000 points); at the mouths of open ones, signs are sure where the winding number is 0.04, 0.001 and
 # less from 0.5.
@@ -32,7 +32,7 @@ BEYOND = wp.constant(-2)
 
 @wp.struct
 class Bodies:
-    """What kernels need of a packed batch of bodies."""
+    """A packed batch of bodies as an argument of kernels."""
 
     meshes: wp.array[wp.uint64]  # of each body
     face_offsets: wp.array[wp.int32]
@@ -62,8 +62,8 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
     """Nearest surface point of a body and the point's side.
 
     Returns:
-        Local face index, sign (+1 outside, -1 inside), barycentric coordinates, closest point. The face is NOTHING
-        where there is no answer, and BEYOND where the point is outside and no nearer than `within`.
+        Local face index, sign (+1 outside, -1 inside), barycentric coordinates, closest point [m]. The face is NOTHING
+        where there is no closest point, and BEYOND where the point is outside and no nearer than `within` [m].
     """
     nowhere = wp.vec3(wp.nan)
     if not wp.isfinite(point):
@@ -84,7 +84,7 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
                 v = around.v
     else:
         near = wp.mesh_query_point_no_sign(mesh, point, reach)
-        # The ray goes away from the surface, where less is in its way; any other gives the same answer.
+        # The ray leads away from the surface, where it meets fewer faces; any other ray gives the same sign.
         axis = wp.int32(2)
         side = wp.float32(1.0)
         if near.result:
@@ -112,7 +112,7 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
     weights = wp.vec3(u, v, 1.0 - u - v)
     position = position_on(mesh, face, u, v)
     named = named_face(mesh, bodies.rings, bodies.face_offsets[b], face, point)
-    if named != face:  # the same position, or else the nearest to it, on another face
+    if named != face:  # the point of the named face that is nearest to the position, which usually is the position
         part, _around = nearest_part(mesh, named, position)
         coordinates, _distance = nearest_on_part(mesh, named, part, position)
         weights = wp.vec3(coordinates)
@@ -156,7 +156,18 @@ def query_bodies_kernel(
 def query_bodies(
     model: Any, points: torch.Tensor, body_of_point: torch.Tensor, within: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Launches the kernel above: `BodyMeshes.model`, [N, 3], [N] and [N] or [1] to distance, closest, face, weights."""
+    """Launches `query_bodies_kernel`.
+
+    Args:
+        model: The bodies, `BodyMeshes.model`.
+        points: Positions [m], float32 [N, 3].
+        body_of_point: Body of each point, int32 [N].
+        within: Distance from which points outside are not searched further [m], float32 [N], or [1] for all points.
+
+    Returns:
+        Signed distance [m], float32 [N]; closest point [m], float32 [N, 3]; packed index of the nearest face, int32
+        [N]; barycentric coordinates of the closest point on that face, float32 [N, 3].
+    """
     rows, device = len(points), points.device
     distance, closest = allocate((rows,), torch.float32, device), allocate((rows, 3), torch.float32, device)
     face, barycentric = allocate((rows,), torch.int32, device), allocate((rows, 3), torch.float32, device)
@@ -184,7 +195,7 @@ def query_bodies(
 
 @wp.func
 def closest_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
-    """The point of a triangle closest to p: the foot of the perpendicular if inside, or else on the nearest edge."""
+    """The point of a triangle closest to p: the foot of the perpendicular if inside, otherwise on the nearest edge."""
     n = wp.cross(b - a, c - a)
     zero = wp.float64(0.0)
     one = wp.float64(1.0)

@@ -1,11 +1,11 @@
-"""Inside or outside: winding numbers by counting where a ray leaves a body and enters it.
+"""Inside or outside: winding numbers from counting where a ray leaves a body and where it enters.
 
 Manifold-aware transformers, section 4.2 (the sign of d_i); generalised winding numbers of Jacobson et al. 2013, solid
 angles after van Oosterom and Strackee 1983.
 
 The winding number of a closed surface is an integer: the signed number of times that any ray from the point crosses it,
 +1 where the ray leaves and -1 where it enters. Limbs may overlap, and a ray costs a tenth of summing solid angles over
-a tree of faces. A body with holes is closed by caps C, and what they add is taken away again:
+a tree of faces. A body with holes is closed by caps C, whose own contribution is subtracted again:
 
     w(M) = crossings(M + C) - w(C),    w(C) = sum of Ω / 4π,    tan(Ω/2) = det(a,b,c) / (|a||b||c| + (a·b)|c| + ...)
 
@@ -13,14 +13,14 @@ a tree of faces. A body with holes is closed by caps C, and what they add is tak
 | --- | --- | --- |
 | M | mesh | the body's faces |
 | C | caps | a fan over each boundary loop from its lowest vertex: any surface that closes M gives the same w(M) |
-| Ω / 4π | winding_of | of a cap, seen from the point |
+| Ω / 4π | winding_of | solid angle of a cap, seen from the point, as a share of the full one |
 
-Rays run along an axis, so that a face is crossed where its projection contains the point. That is decided edge by edge,
-in the same arithmetic from both faces that share an edge: no ray slips through between two faces or meets both. Which
-ray is taken changes nothing, except within rounding of the surface.
+Rays run along an axis, so that a face is crossed where its projection contains the point. This is decided edge by edge,
+with the same arithmetic for both faces that share an edge: no ray passes between two faces or meets both. The choice of
+the ray changes nothing, except within rounding of the surface.
 
-A cap is skipped where it is too small and far to matter. The few bodies in pieces (`MOST_CAPS`) keep Warp's sums of
-solid angles, since caps are searched one by one.
+A cap that is too small and too far to matter is skipped. Caps are searched one by one; the few bodies with more than
+`MOST_CAPS` of them, which are in pieces, use Warp's sums of solid angles instead.
 """
 
 from __future__ import annotations
@@ -33,38 +33,38 @@ import scipy.sparse.csgraph
 import warp as wp
 
 MOST_CAPS = 512
-"""Caps of a body up to which they are searched one by one."""
+"""Largest number of caps of a body that are searched one by one."""
 FAR = wp.constant(1.0e30)
 ZERO = wp.constant(wp.float64(0.0))
-NEGLIGIBLE = wp.constant(wp.float64(0.01))  # winding number of a loop's caps below which it is first bounded only
-ROUNDING = wp.constant(wp.float64(1.0e-6))  # of a sum of solid angles
+NEGLIGIBLE = wp.constant(wp.float64(0.01))  # a loop whose winding number is below this is at first only bounded
+ROUNDING = wp.constant(wp.float64(1.0e-6))  # rounding error of a sum of solid angles
 PER_TURN = wp.constant(wp.float64(1.0 / (4.0 * np.pi)))
 
 
 class Caps(NamedTuple):
-    """What closes a packed batch of bodies."""
+    """Triangles that close the holes of a packed batch of bodies."""
 
     triangles: np.ndarray
-    """Vertex indices (packed) of the caps, loop by loop, int32 [K, 3]; the first is the fan's centre."""
+    """Packed vertex indices of the caps, loop by loop, int32 [K, 3]; the first corner is the fan's centre."""
     loops: np.ndarray
-    """Where the caps of each loop begin, and the end, int32 [L + 1]."""
+    """Index at which the caps of each loop begin, and K, int32 [L + 1]."""
     bodies: np.ndarray
-    """Where the loops of each body begin, and the end, int32 [B + 1]."""
+    """Index at which the loops of each body begin, and L, int32 [B + 1]."""
 
 
 def caps_of(faces: np.ndarray, vertex_count: int, vertex_starts: list[int]) -> Caps:
-    """Fans that close bodies; none for closed ones.
+    """Fans that close bodies; closed bodies get none.
 
     Args:
-        faces: Packed vertex indices, [G, 3]; of any orientation, edges may be shared by any number of faces.
-        vertex_count: U.
-        vertex_starts: Where the vertices of each body begin, and the end, [B + 1].
+        faces: Packed vertex indices, integers [G, 3], in any orientation; any number of faces may share an edge.
+        vertex_count: Number of vertices U.
+        vertex_starts: Index at which the vertices of each body begin, and U, [B + 1].
     """
     faces = faces.astype(np.int64)
     start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     keys, edge = np.unique(low * vertex_count + high, return_inverse=True)
-    net = np.bincount(edge, np.where(start < end, 1, -1), len(keys)).astype(np.int64)  # times from low to high
+    net = np.bincount(edge, np.where(start < end, 1, -1), len(keys)).astype(np.int64)  # low to high less high to low
     net[keys // vertex_count == keys % vertex_count] = 0
     keys, net = np.repeat(keys, np.abs(net)), np.repeat(np.sign(net), np.abs(net))
     low, high = keys // vertex_count, keys % vertex_count
@@ -74,7 +74,7 @@ def caps_of(faces: np.ndarray, vertex_count: int, vertex_starts: list[int]) -> C
     loop_of_edge = loop_of_vertex[start]
     centre = np.full(vertex_count, vertex_count)
     np.minimum.at(centre, loop_of_edge, start)
-    triangles = np.stack([centre[loop_of_edge], end, start], axis=1)  # runs along the edge the other way
+    triangles = np.stack([centre[loop_of_edge], end, start], axis=1)  # the edge in the opposite direction
     triangles = triangles[(triangles[:, 0] != triangles[:, 1]) & (triangles[:, 0] != triangles[:, 2])]
     triangles = triangles[np.argsort(triangles[:, 0], kind="stable")]
     centres, first = np.unique(triangles[:, 0], return_index=True)
@@ -88,7 +88,7 @@ def caps_of(faces: np.ndarray, vertex_count: int, vertex_starts: list[int]) -> C
 
 @wp.func
 def turns_around(a: wp.vec3, b: wp.vec3, c: wp.vec3, axis: int):
-    """How often the projection of a triangle along an axis goes round the origin: 1, -1 or 0."""
+    """Number of times that the projection of a triangle along an axis goes round the origin: 1, -1 or 0."""
     u = (axis + 1) % 3
     v = (axis + 2) % 3
     turns = wp.int32(0)
@@ -97,7 +97,7 @@ def turns_around(a: wp.vec3, b: wp.vec3, c: wp.vec3, axis: int):
         end = wp.where(k == 0, b, wp.where(k == 1, c, a))
         rising = start[v] <= 0.0
         if rising != (end[v] <= 0.0):
-            low = wp.where(rising, start, end)  # the same order from both faces of an edge
+            low = wp.where(rising, start, end)  # the same order for both faces that share the edge
             high = wp.where(rising, end, start)
             if low[u] * high[v] > high[u] * low[v]:
                 turns += wp.where(rising, 1, -1)
@@ -106,12 +106,12 @@ def turns_around(a: wp.vec3, b: wp.vec3, c: wp.vec3, axis: int):
 
 @wp.func
 def crossing(turns: int, volume: wp.float64, side: float):
-    """How a ray crosses a triangle that it goes through forwards or backwards: +1 leaving by its front, -1, or 0.
+    """How a ray crosses a triangle whose projection contains it: +1 when leaving by the front, -1 by the back, or 0.
 
     Args:
-        turns: From `turns_around`.
-        volume: det(a, b, c), positive behind the triangle.
-        side: Direction of the ray along the axis.
+        turns: Result of `turns_around`.
+        volume: det(a, b, c) [m³], positive behind the triangle.
+        side: Direction of the ray along the axis, +1 or -1.
     """
     if (volume >= ZERO) == ((turns > 0) == (side > 0.0)):
         return wp.where(side > 0.0, turns, -turns)
@@ -120,13 +120,13 @@ def crossing(turns: int, volume: wp.float64, side: float):
 
 @wp.func
 def volume_of(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """det(a, b, c); no negative zero."""
+    """det(a, b, c), in which a negative zero becomes a positive one."""
     return wp.dot(a, wp.cross(b, c)) + ZERO
 
 
 @wp.func
 def crossings(mesh: wp.uint64, point: wp.vec3, axis: int, side: float):
-    """Signed crossings of a ray with a mesh. Its boxes are those that a segment along the axis, to infinity, meets."""
+    """Signed number of crossings of a ray with a mesh. Only faces whose boxes the ray meets are visited."""
     body = wp.mesh_get(mesh)
     lower = point
     upper = point
@@ -169,9 +169,10 @@ def loop_winding(
     crossed: bool,
     seen: bool,
 ):
-    """What the caps of a loop add to the crossings of the ray, if `crossed`, less their winding number, if `seen`.
+    """Crossings of the ray with the caps of a loop, if `crossed`, less the winding number of the caps, if `seen`.
 
-    Both jump at a cap and their difference does not, as long as they agree on the point's side: hence one volume.
+    Both numbers jump at a cap, and their difference does not as long as both place the point on the same side of it:
+    therefore both use one `volume`.
     """
     total = ZERO
     p = wp.vec3d(point)
@@ -207,15 +208,15 @@ def is_inside(
 
     Args:
         mesh: The body.
-        vertices: Packed, as the indices of the caps are.
-        caps: Their corners.
-        loops: Where the caps of each loop begin.
-        loop_size: Radius of each loop around its centre [m], and area of its caps [m²].
-        first_loop: Of the body.
-        last_loop: The one after its last.
+        vertices: Packed vertex positions [m], [U].
+        caps: Packed vertex indices of the caps, [K].
+        loops: Index at which the caps of each loop begin, [L + 1].
+        loop_size: Radius of each loop around its centre [m], and area of its caps [m²], [L].
+        first_loop: First loop of the body.
+        last_loop: Loop after the last one of the body.
         point: Position [m].
-        axis: Of the ray.
-        side: Its direction along the axis, +1 or -1.
+        axis: Axis of the ray, 0, 1 or 2.
+        side: Direction of the ray along the axis, +1 or -1.
     """
     winding = wp.float64(crossings(mesh, point, axis, side))
     unsure = ROUNDING
@@ -235,7 +236,7 @@ def is_inside(
         if crossed or seen:
             winding += loop_winding(vertices, caps, first, last, point, axis, side, crossed, seen)
     if wp.abs(winding - wp.float64(0.5)) <= unsure and unsure > ROUNDING:
-        for loop in range(first_loop, last_loop):  # those that were left out matter after all
+        for loop in range(first_loop, last_loop):  # the loops that were only bounded decide
             size = loop_size[loop]
             gap = wp.float64(wp.length(vertices[caps[loops[loop]][0]] - point) - size[0])
             if gap > ZERO and wp.float64(size[1]) * PER_TURN < NEGLIGIBLE * gap * gap:
@@ -253,7 +254,7 @@ def loop_size_kernel(
     # Out:
     loop_size: wp.array[wp.vec2],
 ):
-    """Radius and area of the caps of each loop, a little too large."""
+    """Radius [m] and area [m²] of the caps of each loop, both slightly overestimated."""
     i = wp.tid()
     radius = wp.float32(0.0)
     area = wp.float32(0.0)

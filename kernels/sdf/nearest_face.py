@@ -1,23 +1,24 @@
-"""Which face of a body is named nearest, where several are equally near.
+"""The rule for the nearest face of a body if several faces are equally near.
 
-Manifold-aware transformers, section 4.2 (the nearest body face of d_i). Around a person, the nearest point of the body
-lies on an edge or a vertex for every fourth point: over a convex edge, the faces on both sides are equally near. Which
-of them a search meets first is a matter of its tree and of rounding, but the network is told how the named face moves.
-So the rule is:
+Manifold-aware transformers, section 4.2 (the nearest body face of d_i). For every fourth point around a person the
+nearest point of the body lies on an edge or a vertex: over a convex edge, the faces on both sides are equally near.
+Which of them a search meets first depends on its tree and on rounding, yet the motion of the named face is an input of
+the network. The rule is therefore:
 
     the nearest point is inside a face     that face
     on an edge                             the smallest index of the faces that share the edge
     at a vertex                            the smallest index of the faces around the vertex
 
-No tolerance is involved. On which part of a face its nearest point lies is told by the signs of dot products in
-float64, which are the same for all faces that share the part. But a search in float32 takes faces for equally near
-whose nearest points are up to some 0.1 mm apart: distances are flat around their minimum, and 1e-7 m of distance is so
-much along the surface. Close to where two parts meet it may come back with the lesser one. Hence the faces around the
-part that was found are asked too, and where one of them is nearer, the rule is applied there.
+No tolerance is involved. The part of a face on which its nearest point lies follows from the signs of dot products in
+float64, which are the same for all faces that share the part. However, a search in float32 cannot distinguish faces
+whose nearest points are up to some 0.1 mm apart: the distance is flat around its minimum, where a difference of 1e-7 m
+corresponds to such a length along the surface. Close to where two parts meet, the search may return the face that is
+slightly further away. Therefore the faces around the part that was found are examined too, and if one of them is
+nearer, the rule is applied there.
 
-What is left are points as far from two places of the body that do not touch, between the legs for instance. There the
-nearest point itself jumps, and within rounding (1e-7 m) of the jump either answer is right: it is harmless to what is
-asked once, and no rule could make it repeatable.
+The rule does not cover points that are equally far from two places of the body that do not touch, for instance between
+the legs. There the nearest point itself jumps, and within rounding (1e-7 m) of the jump either face is right. This does
+no harm to a single query, and no rule could make it repeatable.
 """
 
 from __future__ import annotations
@@ -25,28 +26,28 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-PARTS = wp.constant(6)  # of a face that others may share: corners 0, 1, 2, and edges 3, 4, 5 that begin there
+PARTS = wp.constant(6)  # parts that a face shares with others: corners 0, 1, 2, and edges 3, 4, 5 that begin there
 INSIDE = wp.constant(6)
 NO_PART = wp.constant(-1)
-CLOSE = wp.constant(wp.float64(0.02))  # barycentric, 0.4 mm of a usual edge: where neighbours are asked to be sure
+CLOSE = wp.constant(wp.float64(0.02))  # barycentric, 0.4 mm of a usual edge: closer to a part, its faces are examined
 SLIVER = wp.constant(wp.float64(1.0e-12))  # (2 area / sum of squared edges)²; Warp's searches skip what is thinner
 
 
 def rings_of(faces: np.ndarray, face_starts: list[int]) -> np.ndarray:
-    """For each corner and each edge of each face, the next face that has it too, all round.
+    """For each corner and each edge of each face, the next face that shares it; the faces of a part form a ring.
 
     Args:
-        faces: Packed vertex indices, [G, 3]; an edge may have any number of faces, in any orientation.
-        face_starts: Where the faces of each body begin, and the end, [B + 1].
+        faces: Packed vertex indices, integers [G, 3]; any number of faces may share an edge, in any orientation.
+        face_starts: Index at which the faces of each body begin, and G, [B + 1].
 
     Returns:
-        int32 [G, 6], columns as parts are numbered: 6 times the next face (counted within its body), plus the number
-        the part has there. The last face leads to the first, an only one to itself.
+        int32 [G, 6], one column per part: 6 times the next face (counted within its body), plus the number that the
+        part has in that face. The last face leads to the first; a single face leads to itself.
     """
     start = faces.astype(np.int64)
     end = start[:, [1, 2, 0]]
     count = int(start.max(initial=0)) + 1
-    edges = (1 + np.minimum(start, end)) * count + np.maximum(start, end)  # not among the vertices
+    edges = (1 + np.minimum(start, end)) * count + np.maximum(start, end)  # keys that differ from those of vertices
     keys = np.concatenate([start, edges], axis=1).ravel()
     order = np.argsort(keys, kind="stable")
     is_last = np.append(np.diff(keys[order]) != 0, True)
@@ -71,7 +72,7 @@ def corners_of(mesh: wp.uint64, face: int):
 
 @wp.func
 def along_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
-    """How far a point is beyond the start and beyond the end of each edge of a triangle, times the edge's length."""
+    """Distance of a point beyond the start and beyond the end of each edge of a triangle, times the edge's length."""
     ab, bc, ca = b - a, c - b, a - c
     pa, pb, pc = point - a, point - b, point - c
     after = wp.vec3d(wp.dot(pa, ab), wp.dot(pb, bc), wp.dot(pc, ca))
@@ -81,9 +82,10 @@ def along_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
 
 @wp.func
 def inward_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, after: wp.vec3d, beyond: wp.vec3d):
-    """n · (e × p) = |e|² (f · q) - (e · f) (e · q), p and q from the starts of edge e and the next edge f, for each e.
+    """n · (e × p) = |e|² (f · q) - (e · f) (e · q) for each edge e of a triangle.
 
-    Positive on the inner side of the edge. The three add up to n², n being the cross product of two edges.
+    f is the edge after e; p and q lead to the point from the starts of e and f; n is the cross product of two edges.
+    The number is positive on the inner side of the edge, and the three of them add up to n².
     """
     ab, bc, ca = b - a, c - b, a - c
     return wp.vec3d(
@@ -95,10 +97,11 @@ def inward_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, after: wp.vec3d, beyo
 
 @wp.func
 def nearest_part(mesh: wp.uint64, face: int, point: wp.vec3d):
-    """On which part of a face it is nearest to a point, and the part whose faces may be nearer after all.
+    """The part of a face that is nearest to a point, and the part whose faces may be nearer still.
 
     Returns:
-        Part; NO_PART if the face is a sliver. The same again, or the edge or corner that is close to the nearest point.
+        Nearest part, and the edge or corner close to the nearest point, which is the nearest part if there is none.
+        Both are NO_PART if the face is a sliver.
     """
     a, b, c = corners_of(mesh, face)
     after, beyond = along_edges(a, b, c, point)
@@ -132,7 +135,7 @@ def nearest_part(mesh: wp.uint64, face: int, point: wp.vec3d):
 
 @wp.func
 def nearest_on_part(mesh: wp.uint64, face: int, part: int, point: wp.vec3d):
-    """Barycentric coordinates of the point nearest to a point on that part of a face, and its squared distance [m²]."""
+    """Barycentric coordinates of the nearest point on a given part of a face, and its squared distance [m²]."""
     a, b, c = corners_of(mesh, face)
     after, beyond = along_edges(a, b, c, point)
     inward = inward_of_edges(a, b, c, after, beyond)
@@ -151,13 +154,13 @@ def nearest_on_part(mesh: wp.uint64, face: int, part: int, point: wp.vec3d):
 
 @wp.func
 def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_face: int, face: int, point: wp.vec3):
-    """The face that the rule above names, given one that a search found.
+    """The face that the rule of this module names, starting from a face that a search found.
 
     Args:
         mesh: The body.
-        rings: From `rings_of`.
-        first_face: Of the body, in `rings`.
-        face: Found, counted within the body.
+        rings: Result of `rings_of`, [G, 6].
+        first_face: First row of the body in `rings`.
+        face: Face that the search found, counted within the body.
         point: Position [m].
     """
     p = wp.vec3d(point)
@@ -165,7 +168,7 @@ def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_face: int, fa
     part, around = nearest_part(mesh, nearest, p)
     named = wp.int32(face)
     begin = wp.int32(-1)
-    # It ends: rounds that change anything come nearer.
+    # The loop ends, because each round that changes the face comes nearer to the point.
     while around >= 0 and around < PARTS and begin != PARTS * nearest + around:
         begin = PARTS * nearest + around
         named = nearest

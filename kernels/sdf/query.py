@@ -11,10 +11,10 @@ there.
     | U, T^b | body_vertices, body_faces | the body                                          |
     | d      | distance                  | signed distance [m], negative inside              |
     | c      | closest                   | nearest surface point [m]                         |
-    | b      | barycentric               | its coordinates on the nearest face (corners u_k) |
+    | b      | barycentric               | coordinates of c on the nearest face (corners u_k) |
 
 Gradients hold face and barycentric coordinates fixed: ∂d/∂p = n with n = σ (p − c)/|p − c|,
-∂d/∂u_k = −b_k n, ∂c/∂u_k = b_k, ∂c/∂p = 0. For d this is exact, as c is a minimiser. On the surface itself, n is the
+∂d/∂u_k = −b_k n, ∂c/∂u_k = b_k, ∂c/∂p = 0. For d this is exact, since c is a minimiser. On the surface itself, n is the
 normal of the face.
 """
 
@@ -150,17 +150,17 @@ def signed_distance(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Signed distances and closest points of one body.
 
-    The body's hierarchy is built for this call; keep a `BodyMeshes` where many questions go to the same body.
+    The body's hierarchy is built anew in each call; for many queries of one body, keep a `BodyMeshes`.
 
     Args:
         points: Positions [m], float32 [N, 3].
-        body_vertices: Body [m], float32 [U, 3].
-        body_faces: int32 [G, 3], counter-clockwise seen from outside.
+        body_vertices: Vertex positions of the body [m], float32 [U, 3].
+        body_faces: Vertex indices of the body's faces, int32 [G, 3], counter-clockwise seen from outside.
 
     Returns:
         Signed distance [m], float32 [N], negative inside; nearest surface points [m], float32 [N, 3]; nearest faces,
-        int32 [N]. NaN, NaN and -1 for a point that is not finite. The first two are differentiable in points and
-        body_vertices.
+        int32 [N]. They are NaN, NaN and -1 for a point that is not finite. The first two are differentiable in points
+        and body_vertices.
 
     Raises:
         TypeError: Wrong dtypes.

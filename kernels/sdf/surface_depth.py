@@ -1,19 +1,22 @@
-r"""How deep garments are inside bodies: at vertices, and between them.
+r"""Depth of garments inside bodies: at vertices, and between them.
 
 A vertex of a garment keeps a distance from the body, but the body can still come through an edge or a face whose
-corners are all outside. Looked at are
+corners are all outside. The points examined are
 
 - the vertices,
 - the middles of edges and faces,
 - on every face, the point c nearest to the body vertex u that stands out of it most, and less than l:
-  |u - c| < l with n·(u - x) > 0, u of a body face that looks the same way. Whatever is pointed has a vertex at its tip.
+  |u - c| < l with n·(u - x) > 0, where u belongs to a body face that looks the same way. Anything pointed has a vertex
+  at its tip.
 
-Those inside the body count; their depth is the distance to its surface. What can be left is one edge across another.
+Of these, the points inside the body count; their depth is the distance to its surface. An edge of the body that crosses
+an edge of the garment can still be missed.
 
 | symbol | code | what |
 | --- | --- | --- |
 | x, n | `x, y, z`, `normal` | corners of a face [m], its normal |
-| u, c, l | `tip`, `foot`, `STANDS_OUT` | |
+| u, c | `tip`, `foot` | vertex of the body, the nearest point on a face of the garment [m] |
+| l | `STANDS_OUT` | limit of the distance between them [m] |
 | | `missing` | how much deeper the edges and faces at a vertex are than their corners [m] |
 """
 
@@ -31,20 +34,20 @@ from .bodies import BodyMeshes
 from .closest import Bodies, closest_on_body, closest_on_triangle
 
 STANDS_OUT = wp.constant(0.01)
-"""l [m]. Of what stands out further, vertices that are lower down are found; a bare spike is missed."""
+"""Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""
 
 
 class SurfaceDepth(NamedTuple):
-    """What `surface_depth` finds [m], float32, at least 0."""
+    """Depths that `surface_depth` returns, all in metres, float32 and at least 0."""
 
     vertices: torch.Tensor  # depth of each vertex, [V]
-    garments: torch.Tensor  # of each garment's deepest point, [B]
+    garments: torch.Tensor  # depth of each garment's deepest point, [B]
     missing: torch.Tensor  # at each vertex, how much deeper its edges and faces are than their corners, [V]
 
 
 @wp.func
 def depth_at(bodies: Bodies, b: int, point: wp.vec3) -> float:
-    """How deep a point is inside a body, 0 outside."""
+    """Depth of a point inside a body [m]; 0 outside."""
     depth = wp.float32(0.0)
     _face, sign, _weights, closest = closest_on_body(bodies, b, point, 0.0)
     if sign < 0.0:
@@ -63,8 +66,10 @@ def feet_of_tips(
     # Out:
     feet: wp.array[wp.vec3],
 ):
-    """c of each face, NaN where no body vertex stands out. A kernel of its own: two kinds of queries do not fit in the
-    shared memory of a GPU."""
+    """The point c of each face, NaN where no body vertex stands out.
+
+    This is a kernel of its own, because two kinds of queries do not fit in the shared memory of a GPU.
+    """
     i = wp.tid()
     feet[i] = wp.vec3(wp.nan)
     b = body_of_vertex[faces[i][0]]
@@ -134,7 +139,7 @@ def depth_between_vertices(
     missing: wp.array[wp.float32],  # accumulated
     deepest: wp.array[wp.float32],  # accumulated
 ):
-    """Of one edge or one face."""
+    """Depth between the vertices of one edge or one face."""
     i = wp.tid()
     corner = wp.vec3i()
     is_face = i >= edges.shape[0]
@@ -174,12 +179,12 @@ def surface_depth(
     """Depths of a packed batch of garments; without gradients.
 
     Args:
-        vertices: Positions [m], float32 [V,3]; those that are not finite count as outside.
-        bodies: The bodies in the same frame.
-        body_of_vertex: Body of each vertex, int32 [V]; those on body -1 are in none.
-        edges: Vertex indices of every edge, int32 [E,2].
-        faces: Vertex indices, int32 [F,3].
-        garment_of_vertex: Owners, int32 [V].
+        vertices: Positions [m], float32 [V,3]; vertices that are not finite count as outside.
+        bodies: The bodies at the same time step.
+        body_of_vertex: Body of each vertex, int32 [V]; a vertex with body -1 is in no body.
+        edges: Packed vertex indices of every edge, int32 [E,2].
+        faces: Packed vertex indices, int32 [F,3].
+        garment_of_vertex: Garment of each vertex, int32 [V].
         count: Number of garments B.
 
     Raises:

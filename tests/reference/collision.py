@@ -10,7 +10,7 @@ from scipy.sparse.linalg import spsolve
 
 
 def contacts(vertices: np.ndarray, body_vertices: np.ndarray, body_faces: np.ndarray, epsilon: float):
-    """Indices of the vertices closer than epsilon, their closest surface points and outward directions."""
+    """Indices of the vertices closer to the body than epsilon [m], closest surface points [m], outward directions."""
     distance, _, closest, _ = igl.signed_distance(
         vertices.astype(np.float64),
         body_vertices.astype(np.float64),
@@ -39,7 +39,7 @@ def refine(
     lambda_lap: float = 0.5,
     lambda_reg: float = 1e-3,
 ) -> np.ndarray:
-    """Minimiser of eq. 5 of the supplement for given contacts, solved for V itself rather than for an increment."""
+    """Minimiser of eq. 5 of the supplement for given contacts [m], [V, 3], solved for V and not for an increment."""
     vertices = vertices.astype(np.float64)
     matrix = base(rest, faces, lambda_lap, lambda_reg)
     rows = np.repeat(np.arange(len(index)), 3)
@@ -52,14 +52,15 @@ def refine(
 
 
 def entry(origin: np.ndarray, end: np.ndarray, body_vertices: np.ndarray, body_faces: np.ndarray):
-    """Where ways first meet a body: points and outward normals, NaN where they meet none or come out of it.
+    """First points at which straight paths enter a body [m], [N, 3], and outward normals there, [N, 3].
 
-    Every way against every face: the signed volumes of the tetrahedra that it spans with the face's edges.
+    They are NaN where a path does not meet the body, or leaves it. Every path is tested against every face, by the
+    signed volumes of the tetrahedra that it spans with the face's edges.
     """
     a, b, c = (body_vertices[body_faces[:, k]].astype(np.float64) for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points, found = np.full(origin.shape, np.nan), np.full(origin.shape, np.nan)
+    points, outward = np.full(origin.shape, np.nan), np.full(origin.shape, np.nan)
     for i, (o, p) in enumerate(zip(origin.astype(np.float64), end.astype(np.float64), strict=True)):
         along = normals @ (p - o)
         with np.errstate(all="ignore"):
@@ -69,5 +70,5 @@ def entry(origin: np.ndarray, end: np.ndarray, body_vertices: np.ndarray, body_f
         if met.any():
             first = np.flatnonzero(met)[np.argmin(t[met])]
             if along[first] < 0:
-                points[i], found[i] = o + t[first] * (p - o), normals[first]
-    return points, found
+                points[i], outward[i] = o + t[first] * (p - o), normals[first]
+    return points, outward

@@ -8,8 +8,8 @@ from . import deformation
 
 
 def body_motion(vertices: np.ndarray, next_vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Deformation gradients [G, 3, 3] of body faces from one frame to the next, and displacements [G, 3] of their
-    centroids."""
+    """Deformation gradients [G, 3, 3] of body faces from one frame to the next, and displacements of their centroids
+    [m], [G, 3]."""
     velocity = deformation.face_centroids(next_vertices, faces) - deformation.face_centroids(vertices, faces)
     return deformation.deformation_gradient(vertices, next_vertices, faces), velocity
 
@@ -17,7 +17,7 @@ def body_motion(vertices: np.ndarray, next_vertices: np.ndarray, faces: np.ndarr
 def face_features(
     rest_vertices, vertices, faces, garment_of_face, garment_mean, closest, sign, body_deformation, body_velocity
 ):
-    """[F, 34], put together feature by feature."""
+    """Features [F, 34], computed one by one."""
     phi = deformation.deformation_gradient(rest_vertices, vertices, faces)
     centroid = deformation.face_centroids(vertices, faces)
     to_body = closest.astype(np.float64) - centroid

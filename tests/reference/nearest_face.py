@@ -8,18 +8,18 @@ import numpy as np
 
 
 class Nearest(NamedTuple):
-    """Of N points."""
+    """The face named nearest to each of N points."""
 
     face: np.ndarray
-    """The smallest index of the faces around the nearest simplex, [N]."""
+    """Smallest index of the faces around the nearest simplex, [N]."""
     corners: np.ndarray
-    """1, 2 or 3 where that is a vertex, an edge or a face, [N]."""
+    """Number of corners of the nearest simplex, [N]: 1 for a vertex, 2 for an edge, 3 for a face."""
     rival: np.ndarray
-    """How much farther [m] the nearest simplex is that has no vertex in common with it and its faces, [N]."""
+    """Additional distance [m], [N], of the nearest simplex that shares no vertex with that simplex and its faces."""
 
 
 def nearest_face(points, vertices, faces) -> Nearest:
-    """Points [N, 3], vertices [V, 3], faces [F, 3]; faces without area take no part."""
+    """The nearest face of points [N, 3] on a mesh with vertices [V, 3] and faces [F, 3]; ignores faces without area."""
     points, vertices = np.asarray(points, float), np.asarray(vertices, float)
     a, b, c = vertices[faces.T]
     sound = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12 * np.ptp(vertices, axis=0).max() ** 2)
@@ -45,7 +45,7 @@ def nearest_face(points, vertices, faces) -> Nearest:
 
 
 def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """To the points of an open simplex, infinite where the foot of the perpendicular is not one of them."""
+    """Distance of points to an open simplex [m], infinite if the foot of the perpendicular is not inside it."""
     spread = (corners[1:] - corners[0]).T
     inner = np.linalg.solve(spread.T @ spread, spread.T @ (points - corners[0]).T).T
     weights = np.column_stack([1.0 - inner.sum(axis=1), inner])

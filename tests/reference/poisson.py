@@ -36,7 +36,7 @@ def solve(
     pin_weight: float = 0.0,
     pin_targets: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Minimiser of Σ s |Φ(V) - Φ|² plus the pins' energy; every vertex must have a face. Float64 [V,3]."""
+    """Minimiser of Σ s |Φ(V) - Φ|² plus the pins' energy [m], float64 [V,3]; every vertex must have a face."""
     laplacian, weighted = operators(rest, faces)
     right = weighted @ phi.astype(np.float64).transpose(2, 0, 1).reshape(-1, 3)
     result = np.zeros((len(rest), 3))

@@ -6,5 +6,5 @@ from scipy.sparse.csgraph import dijkstra
 
 
 def distances(graph: csr_matrix, sources: np.ndarray, limit: float = np.inf) -> np.ndarray:
-    """Lengths of the shortest paths, float64 [S,N]; `inf` where there is none, or none within the limit."""
+    """Lengths of the shortest paths, float64 [S,N]; `inf` where no path exists within the limit."""
     return dijkstra(graph, indices=sources, limit=limit)

@@ -8,12 +8,12 @@ import numpy as np
 
 
 def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[N], exact generalised winding numbers."""
+    """Exact generalised winding numbers, [N]."""
     return igl.winding_number(vertices.astype(np.float64), faces.astype(np.int64), points.astype(np.float64))
 
 
 def unsigned_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[N], distances to the surface."""
+    """Distances to the surface [m], [N]."""
     squared = igl.point_mesh_squared_distance(
         points.astype(np.float64), vertices.astype(np.float64), faces.astype(np.int64)
     )[0]
@@ -21,13 +21,13 @@ def unsigned_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarra
 
 
 def signed_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[N], negative where the winding number exceeds one half."""
+    """Signed distances [m], [N], negative where the winding number exceeds one half."""
     sign = np.where(winding_number(points, vertices, faces) > 0.5, -1.0, 1.0)
     return sign * unsigned_distance(points, vertices, faces)
 
 
 def pseudonormal_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[N], signed by the normal of the closest feature: right only where surfaces do not overlap."""
+    """Distances [m], [N], with the sign by the normal of the closest feature, which is right if no surfaces overlap."""
     return igl.signed_distance(
         points.astype(np.float64),
         vertices.astype(np.float64),
@@ -37,7 +37,7 @@ def pseudonormal_distance(points: np.ndarray, vertices: np.ndarray, faces: np.nd
 
 
 def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """[N, 3], coordinates of points in the planes of triangles [N, 3, 3], by least squares."""
+    """Barycentric coordinates [N, 3] of points in the planes of triangles [N, 3, 3], by least squares."""
     points, corners = points.astype(np.float64), corners.astype(np.float64)
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     edges = np.stack([e1, e2], axis=2)

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def air_forces(vertices, velocities, faces, air, world=None, drag=1.2, lift=0.6, density=1.225):
-    """[V, 3]: by the angle between face and wind, and directions from cross products."""
+    """Forces of the air [N], [V, 3], from the angle between face and wind, with directions from cross products."""
     points, speeds, air = (np.asarray(a, np.float64) for a in (vertices, velocities, air))
     world = np.zeros(len(points), int) if world is None else world
     force = np.zeros_like(points)

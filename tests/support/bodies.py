@@ -19,7 +19,7 @@ SMPL_JOINTS = (
 
 @lru_cache(maxsize=1)
 def rest_body() -> RestBody:
-    """The body that ships with the demo, in its rest pose."""
+    """The demo's body in its rest pose."""
     return bundled_body()
 
 
@@ -27,9 +27,10 @@ def write_bvh(path: Path, joints: list[tuple[str, str | None, tuple[float, float
     """Writes a BVH file.
 
     Args:
-        path: The file.
-        joints: Name, parent (None for the root) and offset, parents first.
-        frames: Per frame the root's position, then Z, X, Y rotations [degrees] of every joint in depth-first order.
+        path: File to write.
+        joints: Name, parent (None for the root) and offset from the parent of each joint; parents come first.
+        frames: For each frame, the root's position, then Z, X, Y rotations of every joint in depth-first order
+            [degrees].
         fps: Frames per second.
     """
     children = {name: [j for j in joints if j[1] == name] for name, _, _ in joints}
@@ -60,11 +61,11 @@ def write_amass(path: Path, turns: dict[str, np.ndarray], frames: int, rate: flo
     """Writes an AMASS motion in SMPL-H's order.
 
     Args:
-        path: The file.
-        turns: Axis-angles [radians] of the joints that turn, by SMPL's names, shape [T, 3] or [3].
+        path: File to write.
+        turns: Axis-angles of the joints that turn, by SMPL's names [rad], shape [T, 3] or [3].
         frames: Number of frames T.
-        rate: Frames per second; None leaves it out.
-        more: Other arrays; they replace those made here, None leaves one out.
+        rate: Frames per second; None leaves the rate out of the file.
+        more: Other arrays by name, which replace those made here; None leaves an array out of the file.
     """
     poses = np.zeros((frames, 52, 3))
     for name, turn in turns.items():
@@ -76,7 +77,8 @@ def write_amass(path: Path, turns: dict[str, np.ndarray], frames: int, rate: flo
 
 
 def points_around(mesh: meshes.Mesh, count: int = 1500, seed: int = 0) -> np.ndarray:
-    """Half anywhere in a box around the mesh, half within a few hundredths of its size of the surface; float32."""
+    """Points [m], float32 [N, 3]: half of them anywhere in a box around the mesh, half close to its surface, within a
+    few hundredths of the mesh's size."""
     rng = np.random.default_rng(seed)
     low, high = mesh.vertices.min(0).astype(float), mesh.vertices.max(0).astype(float)
     size = np.linalg.norm(high - low)

@@ -14,20 +14,23 @@ BALL = meshes.icosphere(2, 0.15)
 
 
 def on_ball(path: np.ndarray, *cloths: Cloth, **options) -> ClothScene:
-    """Cloths, by default a sheet of 0.5 m, on a ball whose centre goes along a path, [T, 3]."""
+    """Cloths, by default a sheet of 0.5 m, on a ball whose centre moves along a path [m], [T, 3]."""
     frames = (BALL.vertices[None] + np.asarray(path)[:, None]).astype(np.float32)
     options.setdefault("settle", 1)
     return ClothScene(cloths or (sheet(0.5, 0.17),), frames, BALL.faces, **options)
 
 
 def sheet(size: float, height: float, cells: int = 10, **material: float) -> Cloth:
-    """A square sheet facing up."""
+    """A square sheet facing up; size of its side and height in metres."""
     edge = size / cells
     return Cloth(flat_sheet(size, edge, height=height), edge, material=Material(**material))
 
 
 def flag(frames: int = 6, wind=(0.0, 0.0, 0.0), **options) -> ClothScene:
-    """A flag 0.3 m long in the plane z = 0, pinned along x = 0, no body; a wind for all frames or one each."""
+    """A flag 0.3 m long in the plane z = 0, pinned along x = 0, without a body.
+
+    `wind` [m/s] is one velocity for all frames, [3], or one per frame, [T, 3].
+    """
     edge = 0.05
     hung = hanging_sheet(0.2, 0.3, edge)
     turned = np.stack([-hung.vertices[:, 1], hung.vertices[:, 0], hung.vertices[:, 2]], 1)
@@ -38,7 +41,7 @@ def flag(frames: int = 6, wind=(0.0, 0.0, 0.0), **options) -> ClothScene:
 
 
 def still(frames: int) -> np.ndarray:
-    """A path that goes nowhere."""
+    """A path that stays at the origin, [T, 3]."""
     return np.zeros((frames, 3))
 
 

@@ -7,7 +7,7 @@ import torch
 
 
 def close(result: torch.Tensor, expected, tolerance: float) -> None:
-    """Every number finite and near; NaN is never near."""
+    """Asserts that every number is finite and within a tolerance of the expected one; NaN never is."""
     expected = torch.as_tensor(np.asarray(expected), dtype=torch.float64)
     assert result.shape == expected.shape
     assert torch.isfinite(result).all()

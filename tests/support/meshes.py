@@ -21,7 +21,7 @@ class Mesh(NamedTuple):
     faces: np.ndarray
 
     def scaled(self, factor: float) -> Mesh:
-        """The same mesh, `factor` times as large."""
+        """The mesh scaled by a factor about the origin."""
         return Mesh((self.vertices.astype(np.float64) * factor).astype(np.float32), self.faces)
 
 
@@ -30,7 +30,7 @@ def _mesh(vertices, faces) -> Mesh:
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    """Puts meshes end to end in one; face indices become those of the joint vertex array."""
+    """Packs meshes end to end in one mesh; face indices become those of the packed vertex array."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     return _mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -52,7 +52,7 @@ def tetrahedron() -> Mesh:
 
 
 def icosphere(subdivisions: int = 2, radius: float = 0.5, centre=(0.0, 0.0, 0.0)) -> Mesh:
-    """Closed sphere of 20 * 4**subdivisions faces."""
+    """A closed sphere of 20 * 4**subdivisions faces; radius and centre in metres."""
     golden = (1.0 + 5.0**0.5) / 2.0
     points = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0), (0, -1, golden), (0, 1, golden)]
     points += [(0, -1, -golden), (0, 1, -golden), (golden, 0, -1), (golden, 0, 1), (-golden, 0, -1), (-golden, 0, 1)]
@@ -80,7 +80,8 @@ def icosphere(subdivisions: int = 2, radius: float = 0.5, centre=(0.0, 0.0, 0.0)
 def skirt(
     around: int = 24, down: int = 8, waist: float = 0.2, hem: float = 0.38, top: float = 1.0, bottom: float = 0.5
 ):
-    """Open cone about the y axis with two boundary loops, 2 * around * down faces, normals outwards."""
+    """An open cone about the y axis with two boundary loops and 2 * around * down faces, normals outwards; lengths in
+    metres."""
     angles = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
     vertices, faces = [], []
     for k in range(down + 1):
@@ -95,7 +96,8 @@ def skirt(
 
 
 def irregular_grid(columns: int = 14, rows: int = 10, width: float = 0.6, height: float = 0.4, seed: int = 0) -> Mesh:
-    """A sheet of cloth whose inner vertices were moved by up to a third of the spacing: triangles of every shape."""
+    """A sheet of cloth whose inner vertices were moved by up to a third of the spacing, so that triangles have all
+    shapes."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.linspace(0, width, columns + 1), np.linspace(0, height, rows + 1))
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
@@ -112,13 +114,13 @@ def irregular_grid(columns: int = 14, rows: int = 10, width: float = 0.6, height
 
 
 def two_components() -> Mesh:
-    """A skirt and, lying apart from it, a sheet: one outfit of two pieces."""
+    """A skirt and a separate sheet, which together are one outfit of two pieces."""
     sheet = irregular_grid(6, 5, seed=1)
     return joined(skirt(12, 4), Mesh(sheet.vertices + np.float32([0.0, 1.2, 0.3]), sheet.faces))
 
 
 def capsule(start, end, radius: float, around: int = 12, rings: int = 4) -> Mesh:
-    """Closed capsule between two points."""
+    """A closed capsule between two points [m]."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     axis = (end - start) / np.linalg.norm(end - start)
     side = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
@@ -180,7 +182,7 @@ def overlapping_spheres() -> Mesh:
 
 
 def moved(mesh: Mesh, seed: int = 0, strength: float = 0.3) -> Mesh:
-    """The mesh after a smooth bend, twist, stretch and rotation; relative to its size, so that it commutes with
+    """The mesh after a smooth bend, twist, stretch and rotation relative to its size, so that this commutes with
     scaling."""
     rng = np.random.default_rng(seed)
     vertices = mesh.vertices.astype(np.float64)
@@ -196,7 +198,7 @@ def moved(mesh: Mesh, seed: int = 0, strength: float = 0.3) -> Mesh:
 
 
 def garments() -> dict[str, Mesh]:
-    """Five rest meshes that differ in what could go wrong."""
+    """Five rest meshes by name, which differ in their difficulties for a kernel."""
     return {
         "tetrahedron": tetrahedron(),
         "icosphere": icosphere(1),
@@ -207,7 +209,7 @@ def garments() -> dict[str, Mesh]:
 
 
 def bodies() -> dict[str, Mesh]:
-    """Five bodies: closed, overlapping, posed, open and in pieces."""
+    """Five bodies by name: closed, overlapping, posed, open and in pieces."""
     return {
         "tetrahedron": tetrahedron(),
         "overlapping_spheres": overlapping_spheres(),

@@ -1,5 +1,5 @@
-"""Fills what operators allocate with NaN before their kernels run, so that an entry nobody wrote can't pass for a
-result."""
+"""Fills the outputs that operators allocate with NaN before their kernels run, so that an entry that no kernel wrote
+cannot pass for a result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes files of other people's formats byte by byte, for the tests of the readers; uses none of their code."""
+"""Writers for files of data sets by others, byte by byte, for the tests of the readers; they use no code of these."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ TRIANGLES = np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
 
 
 def moving(vertices: np.ndarray, frames: int) -> np.ndarray:
-    """Positions [T, V, 3] that 16-bit floats hold exactly: every vertex moves its own way by eighths."""
+    """Positions [T, V, 3] that 16-bit floats hold exactly: every vertex moves on its own path by eighths."""
     steps = np.arange(frames)[:, None, None] * (1 + np.arange(len(vertices))[None, :, None] % 3) * [[[1.0, -1.0, 2.0]]]
     return vertices[None] + steps / 8.0
 
 
 def write_point_cache(path: Path, frames: np.ndarray, kind: str = "f", version: int = 1, samples: int | None = None):
-    """PC2 (kind "f") or PC16 (kind "e"): header and numbers by struct."""
+    """Writes PC2 (kind "f") or PC16 (kind "e") with frames [T, V, 3]: header and numbers by struct."""
     count = len(frames) if samples is None else samples
     head = struct.pack("<12siiffi", b"POINTCACHE2\0", version, frames.shape[1], 0.0, 1.0, count)
     path.write_bytes(head + struct.pack(f"<{frames.size}{kind}", *frames.ravel()))
 
 
 def write_obj(path: Path, vertices: np.ndarray, polygons) -> None:
-    """OBJ with texture coordinates at every corner, as Blender writes it."""
+    """Writes OBJ with texture coordinates at every corner, as Blender does."""
     lines = ["# a comment", *(f"v {x} {y} {z}" for x, y, z in np.asarray(vertices).tolist()), "vt 0 0", "s 1"]
     lines += ["f " + " ".join(f"{i + 1}/1" for i in polygon) for polygon in polygons]
     path.write_text("\n".join(lines) + "\n")
 
 
 def write_usda(path: Path, meshes: dict[str, np.ndarray], fps: float = 24.0) -> None:
-    """USD text, Z up and in centimetres: one mesh of TRIANGLES a name, positions [T, V, 3] as given."""
+    """Writes USD as text, Z up and in centimetres: one mesh of TRIANGLES per name, with positions [T, V, 3]."""
     frames = len(next(iter(meshes.values())))
     lines = ["#usda 1.0", "(", '    upAxis = "Z"', "    metersPerUnit = 0.01", f"    timeCodesPerSecond = {fps}"]
     lines += ["    startTimeCode = 1", f"    endTimeCode = {frames}", ")"]

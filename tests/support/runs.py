@@ -1,4 +1,4 @@
-"""Training runs that take seconds, and what their logs say."""
+"""Training runs that take seconds, and readers of their logs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SHAPE = ("embedding=16", "layers=1", "feed_forward=16", "heads=2", "geodesic_rad
 
 
 def config_for(data: Path, out: Path, **changes) -> TrainConfig:
-    """A run of twelve steps with dropout, noise, a pool, validation and saves in between."""
+    """The configuration of a run of twelve steps with dropout, noise, a pool, and validation and saves in between."""
     settings = {
         "steps": 12, "batch_size": 4, "overrides": (*SHAPE, "dropout=0.1"), "validate_every": 8, "validate_frames": 3,
         "save_every": 4, "log_every": 1, "statistics_batches": 2, "device": "cpu", "threads": 1,
@@ -29,7 +29,7 @@ def entries_of(out: Path) -> list[dict]:
 
 
 def losses_of(out: Path) -> dict[int, float]:
-    """Loss by step; a step that is there twice fails."""
+    """Loss by step; fails if a step occurs twice."""
     losses = {entry["step"]: entry["loss"] for entry in entries_of(out)}
     assert len(losses) == len(entries_of(out))
     return losses

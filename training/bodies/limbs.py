@@ -1,11 +1,11 @@
-"""Limbs as tubes, and which parts of a body they may come too close to.
+"""Limbs as tubes, and the parts of a body to which they may come too close.
 
-A limb is a tube around its bone whose radius depends on the place along and around the bone, what it may touch are the
-vertices of other parts. A vertex p at height s and angle a of the bone's frame is
+A limb is a tube around its bone whose radius depends on the place along and around the bone; it may touch the vertices
+of other parts. A vertex p at height s and angle a in the bone's axes is
 
     d = |p - axis(s)| - radius(s, a)
 
-away from it. The radius follows the rest pose's vertices within 2 mm, except close to the joints, where skin folds.
+away from the limb. The radius follows the rest pose's vertices within 2 mm, except near the joints, where skin folds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from .anny import RestBody
 
-SHARE = 0.35  # of its distance in the rest pose that a vertex must keep: about a third of the rest pose's opening
+SHARE = 0.35  # share of its distance in the rest pose that a vertex must keep: about a third of the opening there
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class Tube:
     """A limb segment's surface around its bone.
 
     Attributes:
-        bone: The bone whose head and rotation carry it.
-        axes: Columns: two directions across the bone and the one along it, in the rest pose, [3, 3].
-        span: Heights between which it is measured [m].
-        radius: Over height and angle [m], shape [R, A]; the angle is periodic.
+        bone: Bone whose head and rotation carry the surface.
+        axes: Two directions across the bone and the one along it, in the rest pose, as columns, [3, 3].
+        span: Lowest and highest place along the bone at which the surface is defined [m].
+        radius: Radius as a function of height and angle [m], shape [R, A]; the angle is periodic.
     """
 
     bone: int
@@ -36,7 +36,16 @@ class Tube:
     radius: np.ndarray
 
     def distance(self, points: np.ndarray, head: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """Distance of points [F, N, 3] from the surface [m], negative inside, float32 [F, N]."""
+        """Distance of points from the surface.
+
+        Args:
+            points: Positions in F frames [m], shape [F, N, 3].
+            head: Position of the bone's head [m], shape [F, 3].
+            rotation: Rotation of the bone, shape [F, 3, 3].
+
+        Returns:
+            Distances [m], negative inside, float32 [F, N].
+        """
         frame = (rotation @ self.axes).astype(np.float32)
         local = (points - head[:, None].astype(np.float32)) @ frame
         low, high = self.span
@@ -52,7 +61,7 @@ class Tube:
         return np.sqrt(np.einsum("fnc,fnc->fn", local, local)) - radius
 
     def inwards(self, points: np.ndarray, head: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """Unit vectors across the bone from points [F, N, 3] to its axis, shape [F, N, 3]."""
+        """Unit vectors across the bone from points to its axis, shape [F, N, 3]; arguments as in :meth:`distance`."""
         across = rotation @ self.axes[:, :2]
         inwards = -((points - head[:, None]) @ across) @ across.transpose(0, 2, 1)
         return inwards / (np.linalg.norm(inwards, axis=2, keepdims=True) + 1e-12)
@@ -63,13 +72,13 @@ class Contact:
     """A limb that may come too close to other parts, or to the other limb of the pair.
 
     Attributes:
-        limbs: The bones that are turned; a second one is turned the other way by the same angle.
-        tubes: The first limb's surface.
+        limbs: Bones that are turned; a second bone is turned by the opposite angle.
+        tubes: Surface of the first limb.
         targets: Vertices of the other parts, [N].
-        carriers: The bone that moves each of them most, [N].
-        normals: Their outward normals in the rest pose, [N, 3], along which the limb moves away, however deep it is;
-            None: it moves along its own, for at the groin the trunk's normals point along the thigh.
-        required: What they must keep from each tube [m], one [N] a tube.
+        carriers: Bone that moves each target most, [N].
+        normals: Outward normals of the targets in the rest pose, [N, 3], along which the limb moves away at any depth.
+            None if it moves along its own normals, since at the groin the trunk's normals point along the thigh.
+        required: Distance that the targets must keep from each tube [m], one array [N] per tube.
     """
 
     limbs: tuple[str, ...]
@@ -81,20 +90,20 @@ class Contact:
 
 
 def contacts(body: RestBody, gap: float) -> list[Contact]:
-    """What upper arms and legs may touch: thighs the trunk, legs each other, arms all but arms, shins and feet.
+    """Contacts of upper arms and legs: thighs with the trunk, legs with each other, arms with all but shins and feet.
 
-    Around a joint, a limb and the trunk always meet, so a vertex that is d0 away in the rest pose must only keep
-    min(gap, SHARE * d0), and nothing where it touches there.
+    Around a joint, a limb and the trunk always meet, so a vertex at distance d0 in the rest pose must only keep
+    min(gap, SHARE * d0), and nothing if it touches in the rest pose.
 
     Args:
         body: The body.
-        gap: Distance to keep elsewhere [m].
+        gap: Distance to keep away from joints [m].
     """
     import igl
 
     normals = np.asarray(igl.per_vertex_normals(body.vertices, body.faces.astype(np.int64)))
     carriers = body.bone_indices[np.arange(len(body.vertices)), body.bone_weights.argmax(1)]
-    found = []
+    pairs = []
 
     def add(limbs: tuple[str, ...], tubes: list[Tube], targets: np.ndarray, own_normals: bool = False) -> None:
         targets = np.flatnonzero(targets)
@@ -103,26 +112,32 @@ def contacts(body: RestBody, gap: float) -> list[Contact]:
             distance = tube.distance(body.vertices[None, targets], body.joints[None, tube.bone], np.eye(3)[None])[0]
             required.append(np.where(distance > 0, np.minimum(gap, SHARE * distance), -np.inf))
         away = None if own_normals else normals[targets]
-        found.append(Contact(limbs, tuple(tubes), targets, carriers[targets], away, tuple(required)))
+        pairs.append(Contact(limbs, tuple(tubes), targets, carriers[targets], away, tuple(required)))
 
     arms = body.weight_of("LeftArm", "RightArm")
     legs = body.weight_of("LeftUpLeg", "RightUpLeg")
     trunk = (arms < 0.05) & (legs < 0.05)
     shins = body.weight_of("LeftLeg", "RightLeg")
-    for side in ("Left", "Right"):  # the groin folds: skin there is no measure
+    for side in ("Left", "Right"):  # the skin folds at the groin, so the tube begins lower
         add((f"{side}UpLeg",), [fitted_tube(body, f"{side}UpLeg", f"{side}Leg", 0.3)], trunk, own_normals=True)
     thigh, shin = fitted_tube(body, "LeftUpLeg", "LeftLeg"), fitted_tube(body, "LeftLeg", "LeftFoot")
     other = body.weight_of("RightUpLeg") - body.weight_of("RightFoot")
     add(("LeftUpLeg", "RightUpLeg"), [thigh, shin], other > 0.95)
     for side in ("Left", "Right"):
         add((f"{side}Arm",), [fitted_tube(body, f"{side}Arm", f"{side}ForeArm")], (arms < 0.05) & (shins < 0.5))
-    return found
+    return pairs
 
 
 def fitted_tube(body: RestBody, name: str, child: str, start: float = 0.15, rows: int = 12, angles: int = 16) -> Tube:
-    """The radius around a bone, as a weighted mean of the vertices near each place along and around it.
+    """A tube around a bone whose radius is a weighted mean over the vertices near each place along and around it.
 
-    It begins a share `start` below the joint, whose own bulge belongs to both parts.
+    Args:
+        body: The body.
+        name: Name of the bone.
+        child: Name of the bone at which the tube ends.
+        start: Share of the bone's length at which the tube begins, below the joint, whose bulge belongs to both parts.
+        rows: Number of places along the bone.
+        angles: Number of places around the bone.
     """
     head, length = body.joint(name), body.joint(child) - body.joint(name)
     size = float(np.linalg.norm(length))
@@ -144,5 +159,5 @@ def fitted_tube(body: RestBody, name: str, child: str, start: float = 0.15, rows
 
 
 def heads(body: RestBody, transforms: np.ndarray, bone: int) -> np.ndarray:
-    """Where a bone's head is in each frame [m], shape [F, 3]."""
+    """Position of a bone's head in each frame [m], shape [F, 3]."""
     return transforms[:, bone, :, :3] @ body.joints[bone] + transforms[:, bone, :, 3]

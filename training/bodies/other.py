@@ -1,9 +1,9 @@
 """Bodies for tests only, unlike any that a network is trained on: a wooden mannequin and a creature.
 
 Each is wrapped in one closed surface of about 6,000 even faces: its inside (a winding number, or a formula) is sampled
-on a grid, contoured by marching cubes and remeshed. A vertex follows the bone of the part it lies on, mixed near joints
-by letting these weights diffuse over the surface. Bones carry Anny's names and arms hang at 45 degrees, so that
-garments, motions and the teachers work unchanged.
+on a grid, contoured by marching cubes and remeshed. A vertex follows the bone of its part; near joints the weights are
+mixed by diffusion over the surface. Bones have Anny's names and arms hang at 45 degrees, so that garments, motions and
+teachers work unchanged.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from warpgarment.training.meshes.cutting import averaging, largest_piece, remesh
 
 from .anny import TEMPLATE_FACES, RestBody, smoothed
 
-_CELL = 0.012  # of the grids that surfaces are contoured on [m]
-_ROUNDS = 25  # of diffusion of the weights: some 7 cm at edges of 25 mm
+_CELL = 0.012  # cell of the grids on which surfaces are contoured [m]
+_ROUNDS = 25  # rounds of diffusion of the weights: some 7 cm at edges of 25 mm
 
 # SMPL-X's names of the mannequin's joints, and ours.
 _FROM_SMPLX = {
@@ -48,11 +48,11 @@ def wrapped(
     """One closed surface around closed parts that may overlap or have gaps between them.
 
     Args:
-        vertices: Of all parts [m], shape [V, 3].
-        faces: Outwards, shape [F, 3].
-        closing: Gaps narrower than twice this are filled, creases rounded to this radius [m].
-        cell: Of the grid [m]; what is thinner is lost.
-        wanted: Number of faces aimed at.
+        vertices: Positions of all parts [m], shape [V, 3].
+        faces: Vertex indices, counter-clockwise seen from outside, shape [F, 3].
+        closing: Radius to which creases are rounded [m]; gaps narrower than twice this are filled.
+        cell: Cell of the grid [m]; thinner parts are lost.
+        wanted: Approximate number of faces of the result.
 
     Returns:
         Vertices [m] and faces of the largest connected piece.
@@ -73,13 +73,13 @@ def contoured(
     """The surface where a signed distance is zero, evenly triangulated and without edges.
 
     Args:
-        distance: From points [N, 3] to distances [N] [m], negative inside.
+        distance: Function from points [m], [N, 3], to signed distances [m], [N], negative inside.
         low, high: Corners of a box that holds the inside [m].
-        cell: Of the grid [m]; what is thinner is lost.
-        wanted: Number of faces aimed at.
+        cell: Cell of the grid [m]; thinner parts are lost.
+        wanted: Approximate number of faces of the result.
 
     Returns:
-        Vertices [m] and faces, outwards, of the largest connected piece.
+        Vertices [m] and faces, counter-clockwise seen from outside, of the largest connected piece.
     """
     vertices, faces = largest_piece(*_contour(distance, low, high, cell))
     vertices, faces, _ = remeshed(vertices, faces, wanted)
@@ -103,7 +103,7 @@ def _contour(
 
 
 def _signed_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    sign = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER  # right where parts overlap
+    sign = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER  # correct even where parts overlap
     return igl.signed_distance(points, vertices, np.ascontiguousarray(faces, dtype=np.int64), sign_type=sign)[0]
 
 
@@ -117,10 +117,10 @@ def rigged(
     """A body whose vertices follow the bones of their parts, mixed near joints.
 
     Args:
-        vertices: Surface [m], shape [U, 3]; it is put on the floor.
-        faces: Shape [G, 3].
-        parts: Name of the bone that each vertex lies on, shape [U].
-        joints: Rest position of each bone's head [m].
+        vertices: Positions of the surface [m], shape [U, 3]; the body is moved onto the floor.
+        faces: Vertex indices, shape [G, 3].
+        parts: Name of the bone to whose part each vertex belongs, shape [U].
+        joints: Rest position of each bone's head by name [m].
         tree: Parent of each bone by name, None for the root; parents come first.
     """
     names = tuple(tree)
@@ -145,7 +145,7 @@ def rigged(
 
 @lru_cache(maxsize=1)
 def mannequin_body() -> RestBody:
-    """The wooden mannequin of mannequin-x: 29 turned parts in one skin.
+    """The wooden mannequin of mannequin-x: 29 rounded parts in one skin.
 
     Raises:
         MissingExtra: mannequin-x is not installed.
@@ -162,15 +162,15 @@ def mannequin_body() -> RestBody:
         pose["body_pose"][turnable.index(f"{side}_Shoulder"), 2] = turn * np.pi / 4
     vertices = np.asarray(model.vertices(pose), dtype=np.float64)
     part = np.full(len(vertices), "Hips", dtype="U16")
-    for row, name in enumerate(turnable):  # a vertex lies on the last joint that moves it
+    for row, name in enumerate(turnable):  # a vertex belongs to the last joint that moves it
         probe = {key: np.array(value) for key, value in pose.items()}
         probe["body_pose"][row, 0] += 0.3
         part[np.abs(np.asarray(model.vertices(probe)) - vertices).max(1) > 1e-4] = _FROM_SMPLX[name]
     places = np.asarray(model.joint_transforms(pose), dtype=np.float64)[:, :3, 3]
-    found = {_FROM_SMPLX[n]: places[i] for i, n in enumerate(model.joint_names) if n in _FROM_SMPLX}
+    placed = {_FROM_SMPLX[n]: places[i] for i, n in enumerate(model.joint_names) if n in _FROM_SMPLX}
     surface, triangles = wrapped(vertices, faces)
     _, nearest, _ = igl.point_mesh_squared_distance(surface, vertices, faces.astype(np.int64))
-    return rigged(surface, triangles, part[faces[nearest, 0]], _symmetric(found), _TREE)
+    return rigged(surface, triangles, part[faces[nearest, 0]], _symmetric(placed), _TREE)
 
 
 def _symmetric(joints: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -206,16 +206,16 @@ _CREATURE: dict[str, list[tuple[Any, ...]]] = {
     "LeftToeBase": [("capsule", (0.18, 0.05, 0.08), (0.19, 0.045, 0.17), 0.055, 0.045)],
     "Tail": [("capsule", (0.0, 0.56, -0.10), (0.0, 0.55, -0.25), 0.055, 0.045)],
 }
-_HEADS = {  # of the bones that do not begin where their shape does
+_HEADS = {  # heads of the bones that do not begin where their shape does [m]
     "Hips": (0.0, 0.66, 0.0), "LowerBack": (0.0, 0.72, -0.01), "Spine": (0.0, 0.85, 0.0), "Spine1": (0.0, 0.97, 0.0),
     "Head": (0.0, 1.24, 0.03),
 }  # fmt: skip
-_BLEND = 0.02  # by which shapes melt into each other [m]
+_BLEND = 0.02  # distance over which shapes blend into each other [m]
 
 
 @lru_cache(maxsize=1)
 def creature_body() -> RestBody:
-    """A creature of our own, 1.7 m tall: long arms, short bent legs, a big head with ears, a stub of a tail."""
+    """An invented creature, 1.7 m tall, with long arms, short bent legs, a big head with ears, and a short tail."""
     flip = np.array([-1.0, 1.0, 1.0])
     shapes = []
     for bone, own in _CREATURE.items():

@@ -1,7 +1,7 @@
-"""Poses: world rotations of the bones, and the bone transforms that carry a rest body there.
+"""Poses: world rotations of the bones, and the bone transforms that pose a rest body.
 
-A pose is the rotation of each bone from the rest pose, in the world (`rotations` [T, B, 3, 3], identity at rest), and
-the position of the root [T, 3]. The bones below hang from their parents' heads.
+A pose is the rotation of each bone from the rest pose, in world axes (`rotations` [T, B, 3, 3], identity at rest), and
+the position of the root [m], [T, 3]. All other bones are attached to their parents.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class PoseSequence:
 
 
 def bone_transforms(body: RestBody, poses: PoseSequence) -> np.ndarray:
-    """Rest-to-posed transform of each bone, float32 [T, B, 3, 4]."""
+    """Rest-to-posed transform [R | t] of each bone, t in metres, float32 [T, B, 3, 4]."""
     rotations = poses.rotations
     heads = np.empty((*rotations.shape[:2], 3))
     for bone, parent in enumerate(body.bone_parents):
@@ -51,10 +51,10 @@ def bone_transforms(body: RestBody, poses: PoseSequence) -> np.ndarray:
 
 
 def posed(body: RestBody, poses: PoseSequence) -> tuple[np.ndarray, np.ndarray]:
-    """The body in every frame, its feet on the floor in most of them.
+    """The body in every frame, with its feet on the floor in most frames.
 
     Returns:
-        Vertices [m], float32 [T, U, 3], and the bone transforms that give them, float32 [T, B, 3, 4].
+        Vertices [m], float32 [T, U, 3], and the bone transforms from which they result, float32 [T, B, 3, 4].
     """
     transforms = bone_transforms(body, poses)
     frames = linear_blend_skinning(body.vertices, body.bone_indices, body.bone_weights, transforms)
@@ -65,7 +65,7 @@ def posed(body: RestBody, poses: PoseSequence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def longest_run(bad: np.ndarray) -> slice:
-    """The longest run of frames that are not bad, of bool [T]; empty where there is none."""
+    """The longest run of frames that are not marked in the mask `bad`, bool [T]; empty if there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[True], bad, [True]]).astype(int)))
     starts, ends = edges[::2], edges[1::2]
     if not len(starts):
@@ -75,7 +75,7 @@ def longest_run(bad: np.ndarray) -> slice:
 
 
 def heading(rotations: np.ndarray) -> np.ndarray:
-    """Rotation about +Y nearest to each rotation [..., 3, 3], as an angle [rad]."""
+    """Angle of the rotation about +Y that is nearest to each rotation [..., 3, 3], [rad], shape [...]."""
     return np.arctan2(rotations[..., 0, 2] - rotations[..., 2, 0], rotations[..., 0, 0] + rotations[..., 2, 2])
 
 
@@ -85,20 +85,20 @@ def about_y(angle: np.ndarray) -> np.ndarray:
 
 
 def turned(poses: PoseSequence, angle: float) -> PoseSequence:
-    """The same motion, turned about the vertical through the origin by an angle [rad]."""
+    """The motion, turned about the vertical through the origin by an angle [rad]."""
     turn = about_y(np.array(angle))
     return replace(poses, rotations=turn @ poses.rotations, root=poses.root @ turn.T)
 
 
 def facing_forward(poses: PoseSequence) -> PoseSequence:
-    """The same motion, starting above the origin and facing +Z."""
+    """The motion, moved and turned so that it starts above the origin and faces +Z."""
     start = poses.root[0] * np.array([1.0, 0.0, 1.0])
     moved = replace(poses, root=poses.root - start)
     return turned(moved, -float(heading(poses.rotations[0, 0])))
 
 
 def arms_abducted(body: RestBody, poses: PoseSequence, degrees: float) -> PoseSequence:
-    """Lifts the upper arms away from the torso about the chest's forward axis, so that they do not pinch cloth."""
+    """The motion with the upper arms lifted about the chest's forward axis, so that they do not pinch cloth."""
     rotations = poses.rotations.copy()
     forward = rotations[:, body.bone("Spine1")] @ np.array([0.0, 0.0, 1.0])
     for arm, side in (("LeftArm", 1.0), ("RightArm", -1.0)):
@@ -109,9 +109,9 @@ def arms_abducted(body: RestBody, poses: PoseSequence, degrees: float) -> PoseSe
 
 
 def blended_in(body: RestBody, poses: PoseSequence, frames: int) -> PoseSequence:
-    """Prepends a smooth transition from the rest pose to the first pose.
+    """Prepends a smooth transition from the rest pose to the first pose, which takes a number of frames.
 
-    Each bone turns relative to its parent; root position and heading stay those of the first pose throughout.
+    Each bone turns relative to its parent; root position and heading are those of the first pose throughout.
     """
     parents = body.bone_parents
     first = poses.rotations[0]
@@ -135,7 +135,7 @@ def blended_in(body: RestBody, poses: PoseSequence, frames: int) -> PoseSequence
 
 
 def mirrored(body: RestBody, poses: PoseSequence) -> PoseSequence:
-    """The motion seen in a mirror: left and right exchanged about the YZ plane."""
+    """The mirror image of the motion: left and right are exchanged about the YZ plane."""
     names = list(body.bone_names)
 
     def twin(name: str) -> int:

@@ -1,7 +1,7 @@
 """A page about a data set: `warpgarment dataset card DIR` writes DIR/card.md and its pictures, DIR/card/*.png.
 
-Everything on it is read from the set itself: what it is and how it was made, counts by split and category, motions,
-body shapes, quality figures, rejections, materials and wind where there are any, pictures, licences and credits.
+All contents are read from the set itself: its kind and the command that made it, counts by split and category, motions,
+body shapes, quality figures, rejections, materials and wind if there are any, pictures, licences and credits.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .card_pictures import bars, contact_sheet, histograms
 from .layout import SPLITS
 
 PICTURES = 12
-_FIGURES = {  # of the quality gate: heading, factor
+_FIGURES = {  # figure of the quality gate -> heading, factor
     "penetration": ("deepest vertex [mm]", 1e3),
     "inside": ("vertices inside the body [%]", 1e2),
     "stretch_mean": ("mean stretch [%]", 1e2),
@@ -42,27 +42,27 @@ _MATERIALS = {
 
 
 class EmptyDataset(ValueError):
-    """There is no good sequence to write about."""
+    """A data set without any good sequence."""
 
 
 def write_card(
     root: str | Path, out: str | Path | None = None, *, pictures: int = PICTURES, size: tuple[int, int] = (240, 320)
 ) -> Path:
-    """Writes the page.
+    """Writes the page and its pictures.
 
     Args:
-        root: The data set's folder.
-        out: Folder for `card.md` and `card/`; the data set's own by default.
-        pictures: Sequences on the contact sheet.
+        root: Folder of the data set.
+        out: Folder for `card.md` and `card/`; None for the folder of the data set.
+        pictures: Number of sequences on the contact sheet.
         size: Width and height of each picture in pixels.
 
     Returns:
-        The page.
+        Path of the page.
 
     Raises:
         FileNotFoundError: There is no such folder.
-        EmptyDataset: It holds no good sequence.
-        MissingExtra: Pictures need `pip install "warpgarment[view]"`.
+        EmptyDataset: The folder holds no good sequence.
+        MissingExtra: The extra for pictures is not installed (`pip install "warpgarment[view]"`).
     """
     root = Path(root)
     out = root if out is None else Path(out)
@@ -84,7 +84,7 @@ def write_card(
 
 
 def chosen(good: Mapping[Path, Mapping[str, Any]], count: int) -> list[Path]:
-    """Sequences for the contact sheet: categories in turn, evenly spread within each."""
+    """Folders of sequences for the contact sheet: categories in turn, evenly spread within each."""
     of: dict[str, list[Path]] = defaultdict(list)
     for folder, manifest in good.items():
         of[str(manifest.get("category"))].append(folder)
@@ -106,7 +106,7 @@ def bodies(facts: Facts) -> Values:
 
 
 def figures(facts: Facts) -> Values:
-    """Quality figures by split; those of layers are shares."""
+    """Quality figures by split; figures of layers are shares (0 to 1)."""
     rows: list[tuple[Mapping[str, Any], str, Any]] = []
     for manifest in facts.good.values():
         values = manifest.get("figures", {})
@@ -116,7 +116,7 @@ def figures(facts: Facts) -> Values:
 
 
 def materials(facts: Facts) -> Values:
-    """Cloth parameters of every garment, by split; nothing where all are the same."""
+    """Cloth parameters of every garment by split; empty if all garments have the same."""
     rows: list[tuple[Mapping[str, Any], str, Any]] = []
     for manifest in facts.good.values():
         for garment in manifest.get("garments") or []:
@@ -128,7 +128,7 @@ def materials(facts: Facts) -> Values:
 
 
 def wind(facts: Facts) -> Values:
-    """Mean and largest speed of the air in each sequence that has any, by split."""
+    """Mean and largest speed of the air [m/s] by split, of the sequences with wind."""
     rows: list[tuple[Mapping[str, Any], str, Any]] = []
     for folder, manifest in facts.good.items():
         if (folder / "wind.npy").exists():
@@ -151,7 +151,7 @@ def _is_number(value: Any) -> bool:
 
 
 def kind_of_reason(reason: str) -> str:
-    """What a reason is about, without its numbers: "frame 54: penetration 11.5 mm is over 10 mm" -> "penetration"."""
+    """The subject of a reason without its numbers: "frame 54: penetration 11.5 mm is over 10 mm" -> "penetration"."""
     text = re.sub(r"^frame \d+: ", "", reason)
     if gate := re.match(r"(\w+) [-\d.]+ ?(?:%|mm) is over", text):
         return gate[1]

@@ -1,4 +1,4 @@
-"""What is counted for the page about a data set."""
+"""The facts about a data set on which its page is based."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 from .sequence import list_sequences, read_manifest
 from .set_manifest import read_set_manifest
 
-Values = dict[str, dict[str, list[float]]]  # quantity -> split -> one value a sequence or garment
+Values = dict[str, dict[str, list[float]]]  # quantity -> split -> one value per sequence or garment
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What the page is about: manifests of good and of rejected sequences, and their folders."""
+    """Manifests of a data set: `common` of the set, `good` by folder, and those of `rejected` sequences."""
 
     root: Path
     common: dict[str, Any]

@@ -34,8 +34,8 @@ def page(facts: Facts, drawn: Mapping[str, Values], reasons: Counter[str]) -> st
 
     Args:
         facts: Manifests of the set.
-        drawn: What there is a histogram of: picture -> quantity -> split -> values.
-        reasons: Rejected attempts by reason.
+        drawn: Values of the histograms: picture -> quantity -> split -> values.
+        reasons: Number of rejected attempts by reason.
     """
     good = list(facts.good.values())
     frames = sum(m["frames"] for m in good)
@@ -89,7 +89,7 @@ def _made(facts: Facts) -> list[str]:
 
 
 def _command(common: Mapping[str, Any]) -> str:
-    """The command line of a configuration."""
+    """The command line that makes a set of this configuration."""
     options = [f"--sequences {len(planned_numbers(common))}"] if planned_numbers(common) else []
     for key, value in common["configuration"].items():
         if key == "clips":
@@ -150,7 +150,7 @@ def _rejections(facts: Facts, reasons: Counter[str]) -> list[str]:
 
 
 def credits(facts: Facts) -> list[str]:
-    """Whom bodies, motions and garments of a set are owed to, one line each."""
+    """Credits for the bodies, motions and garments of a set, one line each."""
     good = list(facts.good.values())
     motions = {str(m.get("motion")) for m in good}
     kinds = set(map(_kind_of_body, good))

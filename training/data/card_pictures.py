@@ -25,11 +25,11 @@ def contact_sheet(
     """Draws each sequence at the middle of its motion.
 
     Args:
-        path: PNG to write.
-        folders: Sequences, at least one.
-        columns: Pictures in a row.
+        path: PNG file to write.
+        folders: Folders of the sequences, at least one.
+        columns: Number of pictures in a row.
         size: Width and height of a picture in pixels.
-        samples: Samples a pixel in each direction.
+        samples: Number of samples per pixel in each direction.
     """
     panels = [_panel(SequenceOnDisk.load(folder), k, size, samples) for k, folder in enumerate(folders)]
     columns = min(columns, len(panels))
@@ -40,7 +40,7 @@ def contact_sheet(
 
 
 def _panel(sequence: SequenceOnDisk, number: int, size: tuple[int, int], samples: int) -> np.ndarray:
-    """One sequence; colours depend on its number, so that neighbours differ."""
+    """The picture of one sequence; colours depend on its number, so that neighbours differ."""
     frame = len(sequence) // 2
     body, worn = sequence.body_in(slice(frame, frame + 1)), sequence.vertices[frame]
     surfaces = [draw.Surface(body.vertices[0], body.faces)]
@@ -60,10 +60,10 @@ def histograms(
     """Draws one histogram per quantity, stacked by split.
 
     Args:
-        path: PNG to write.
+        path: PNG file to write.
         values: Quantity -> split -> values.
-        columns: Histograms in a row.
-        bins: Of each histogram.
+        columns: Number of histograms in a row.
+        bins: Number of bins of each histogram.
     """
     figure, axes = _axes(len(values), columns)
     for axis, (title, splits) in zip(axes, values.items(), strict=True):

@@ -1,16 +1,16 @@
-"""How the arrays of a sequence are stored: few bytes, bounded errors, the same again when what was read is written.
+"""Encoding of the arrays of a sequence: few bytes, bounded errors, and no further change when read and written again.
 
 | what | stored as | largest error |
 | --- | --- | --- |
 | positions | uint16 within the bounding box of their frame | half a step, size / 131,070: 0.008 mm at 1 m |
 | rotations | the quaternion over its largest component, the other three in 20 bits: 8 bytes | 4e-6 rad |
 | translations | multiples of 2^-17 m above the frame's lowest, 21 bits a coordinate: 8 bytes | 0.004 mm |
-| skinning weights | 65,535ths that sum to 65,535; the last bone's is what the others leave | 1.6e-5 |
+| skinning weights | 65,535ths that sum to 65,535; that of the last bone is the remainder | 1.6e-5 |
 | indices | the smallest of uint8, uint16 and int32 that holds them | none |
-| masks | 8 faces a byte | none |
+| masks | 8 faces per byte | none |
 
-A moving body of 31 bones is 508 bytes a frame whatever its number of vertices. Its arrays are read back as exactly the
-same numbers however often they are written, so that cloth can be simulated on the body that will be stored:
+A moving body of 31 bones takes 508 bytes per frame, regardless of its number of vertices. Arrays that were read and are
+written again give exactly the same numbers, so that cloth can be simulated on the body that will be stored:
 :func:`stored_body` and :func:`stored_transforms`.
 """
 
@@ -23,22 +23,22 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
 
-STEPS = 65535  # of a box, and of a skinning weight of 1
+STEPS = 65535  # number of steps within a box, and within a skinning weight of 1
 GRID = 2.0**-17  # m: exact in float32 up to 128 m from the origin
 TRANSLATION_BITS, ROTATION_BITS = 21, 20
 _HALF = 2 ** (ROTATION_BITS - 1)
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-_RIGID = 2e-5  # how far R R^T may be from I: 0.02 mm at 1 m
+_RIGID = 2e-5  # largest difference between R R^T and I: 0.02 mm at 1 m
 
 
 def boxed(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions within the bounding boxes of their frames.
+    """Positions as steps within the bounding boxes of their frames.
 
     Args:
-        positions: float32 [..., N, 3] in metres. A frame with a NaN or infinity is stored as NaN throughout.
+        positions: Positions [m], float32 [..., N, 3]. A frame with a NaN or infinity becomes NaN throughout.
 
     Returns:
-        Codes uint16 [..., N, 3] and boxes float32 [..., 2, 3], lowest and highest corner [m].
+        Codes, uint16 [..., N, 3]; boxes, lowest and highest corner [m], float32 [..., 2, 3].
     """
     positions = np.asarray(positions, np.float32)
     finite = np.isfinite(positions).all(axis=(-2, -1), keepdims=True)
@@ -50,7 +50,7 @@ def boxed(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unboxed(codes: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """The positions [m], float32 [..., N, 3], of what :func:`boxed` returned."""
+    """Positions [m], float32 [..., N, 3], from the codes and boxes of :func:`boxed`."""
     low, size = _low_and_size(np.asarray(box))
     return (codes * (size / STEPS) + low).astype(np.float32)
 
@@ -63,15 +63,16 @@ def _low_and_size(box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def packed_rotations(rotations: np.ndarray) -> np.ndarray:
     """Rotations in 8 bytes each.
 
-    A quaternion q and -q are the same rotation and its length does not matter, so it is divided by its largest
-    component; where two are equally large, either gives the same numbers. Bits 0-1: which is the largest; 2-21, 22-41,
-    42-61: the other three, in order, as 2^19 + (2^19 - 1) times their value within -1..1.
+    Quaternions q and -q are the same rotation and their length does not matter, so a quaternion is divided by its
+    largest component; if two are equally large, either choice gives the same numbers. Bits 0-1 hold the index of the
+    largest component; bits 2-21, 22-41 and 42-61 the other three, in order, as 2^19 + (2^19 - 1) times their value
+    within -1..1.
 
     Args:
-        rotations: float [..., 3, 3], rotation matrices.
+        rotations: Rotation matrices, float [..., 3, 3].
 
     Returns:
-        uint64 [...].
+        Codes, uint64 [...].
     """
     shape = np.shape(rotations)[:-2]
     quaternions = Rotation.from_matrix(np.reshape(rotations, (-1, 3, 3)).astype(np.float64)).as_quat()
@@ -83,7 +84,7 @@ def packed_rotations(rotations: np.ndarray) -> np.ndarray:
 
 
 def unpacked_rotations(codes: np.ndarray) -> np.ndarray:
-    """The rotation matrices, float64 [..., 3, 3], of what :func:`packed_rotations` returned."""
+    """Rotation matrices, float64 [..., 3, 3], from the codes of :func:`packed_rotations`."""
     flat = np.asarray(codes).reshape(-1)
     largest = (flat & np.uint64(3)).astype(np.int64)
     others = _unpacked(flat >> np.uint64(2), ROTATION_BITS).astype(np.float64)
@@ -96,14 +97,14 @@ def packed_translations(translations: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Translations in 8 bytes each, on a grid of 2^-17 m.
 
     Args:
-        translations: float [T, B, 3] in metres, those of a frame within 16 m of each other.
+        translations: Translations [m], float [T, B, 3]; those of one frame lie within 16 m of each other.
 
     Returns:
-        uint64 [T, B], bits 0-20 x, 21-41 y, 42-62 z in grid steps from the origin, and origins float32 [T, 3] in
-        metres.
+        Codes, uint64 [T, B], with x in bits 0-20, y in 21-41 and z in 42-62 as grid steps from the origin; origin of
+        each frame [m], float32 [T, 3].
 
     Raises:
-        MeshError: They are further apart.
+        MeshError: Translations of a frame are further apart.
     """
     steps = np.rint(np.asarray(translations, np.float64) / GRID).astype(np.int64)
     origins = steps.min(axis=1)
@@ -118,12 +119,12 @@ def packed_translations(translations: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def unpacked_translations(codes: np.ndarray, origins: np.ndarray) -> np.ndarray:
-    """The translations [m], float64 [T, B, 3], of what :func:`packed_translations` returned."""
+    """Translations [m], float64 [T, B, 3], from the codes and origins of :func:`packed_translations`."""
     return _unpacked(codes, TRANSLATION_BITS) * GRID + origins[:, None].astype(np.float64)
 
 
 def _packed(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Three codes [..., 3] in one uint64, the first lowest."""
+    """Three codes, [..., 3], in one uint64; the first is in the lowest bits."""
     return codes[..., 0] | codes[..., 1] << np.uint64(bits) | codes[..., 2] << np.uint64(2 * bits)
 
 
@@ -136,13 +137,13 @@ def packed_transforms(transforms: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     """Rest-to-posed transforms [R | t] in 16 bytes each.
 
     Args:
-        transforms: float [T, B, 3, 4] in metres, rigid.
+        transforms: Rigid transforms with translations in metres, float [T, B, 3, 4].
 
     Returns:
-        Rotations uint64 [T, B], translations uint64 [T, B], origins float32 [T, 3].
+        Codes of the rotations, uint64 [T, B]; codes of the translations, uint64 [T, B]; origins [m], float32 [T, 3].
 
     Raises:
-        MeshError: Another shape, NaN or infinity, or a transform that is not rigid.
+        MeshError: The shape is another, a number is not finite, or a transform is not rigid.
     """
     transforms = np.asarray(transforms, np.float64)
     if transforms.ndim != 4 or transforms.shape[2:] != (3, 4):
@@ -161,7 +162,7 @@ def packed_transforms(transforms: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def unpacked_transforms(rotations: np.ndarray, translations: np.ndarray, origins: np.ndarray) -> np.ndarray:
-    """The transforms, float32 [T, B, 3, 4], of what :func:`packed_transforms` returned."""
+    """Transforms with translations in metres, float32 [T, B, 3, 4], from the arrays of :func:`packed_transforms`."""
     moves = unpacked_translations(translations, origins)[..., None]
     return np.concatenate([unpacked_rotations(rotations), moves], axis=-1).astype(np.float32)
 
@@ -170,13 +171,13 @@ def packed_weights(weights: np.ndarray) -> np.ndarray:
     """Skinning weights in 65,535ths, rounded so that each vertex's sum stays exact.
 
     Args:
-        weights: float [V, K], not negative, none of the rows zero.
+        weights: Weights that are not negative, with no row zero, float [V, K].
 
     Returns:
-        uint16 [V, K - 1]: the last one is what the others leave.
+        Codes of all bones but the last, whose weight is the remainder, uint16 [V, K - 1].
 
     Raises:
-        MeshError: Weights that are negative or not finite, or vertices without weight.
+        MeshError: A weight is negative or not finite, or a vertex has no weight.
     """
     weights = np.asarray(weights, np.float64)
     total = weights.sum(axis=1, keepdims=True)
@@ -194,7 +195,7 @@ def packed_weights(weights: np.ndarray) -> np.ndarray:
 
 
 def unpacked_weights(codes: np.ndarray) -> np.ndarray:
-    """The weights, float32 [V, K], of what :func:`packed_weights` returned."""
+    """Skinning weights, float32 [V, K], from the codes of :func:`packed_weights`."""
     codes = np.asarray(codes, np.int64)
     last = STEPS - codes.sum(axis=1, keepdims=True)
     return (np.concatenate([codes, last], axis=1) / STEPS).astype(np.float32)
@@ -208,10 +209,16 @@ def packed_indices(indices: np.ndarray) -> np.ndarray:
 
 
 def stored_transforms(bone_transforms: np.ndarray) -> np.ndarray:
-    """Bone transforms as a sequence will be read back, float32 [T, B, 3, 4] of [T, B, 3, 4]; each frame by itself.
+    """Bone transforms as they will be read back from a sequence; each frame is encoded by itself.
+
+    Args:
+        bone_transforms: Rigid transforms with translations in metres, shape [T, B, 3, 4].
+
+    Returns:
+        Transforms after encoding and decoding, float32 [T, B, 3, 4].
 
     Raises:
-        MeshError: As :func:`packed_transforms`.
+        MeshError: As in :func:`packed_transforms`.
     """
     return unpacked_transforms(*packed_transforms(bone_transforms))
 
@@ -219,15 +226,15 @@ def stored_transforms(bone_transforms: np.ndarray) -> np.ndarray:
 def stored_body(
     rest_vertices: np.ndarray, bone_indices: np.ndarray, bone_weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A body's rest vertices, bones and weights as a sequence will be read back, at most 0.02 mm away.
+    """A body's rest vertices, bones and weights as they will be read back from a sequence, at most 0.02 mm away.
 
     Args:
-        rest_vertices: [m], shape [U, 3].
-        bone_indices: Bones of each vertex, shape [U, K].
-        bone_weights: Their weights, shape [U, K].
+        rest_vertices: Rest positions [m], shape [U, 3].
+        bone_indices: Bones that move each vertex, shape [U, K].
+        bone_weights: Weight of each of these bones, shape [U, K].
 
     Returns:
-        The same three: float32 [U, 3], uint8 or uint16 [U, K], float32 [U, K].
+        Rest positions [m], float32 [U, 3]; bones, uint8 or uint16 [U, K]; weights, float32 [U, K].
     """
     weights = unpacked_weights(packed_weights(bone_weights))
     return unboxed(*boxed(rest_vertices)), packed_indices(bone_indices), weights
@@ -237,7 +244,7 @@ def encoded(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of a sequence (`layout.ARRAYS`) as they are stored (`layout.STORED`).
 
     Raises:
-        MeshError: As the functions above.
+        MeshError: An array cannot be stored, for the reasons that the functions above name.
     """
     stored: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
@@ -257,7 +264,11 @@ def encoded(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def decoded(stored: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """One array of a sequence, of those that :func:`encoded` returned. KeyError where it is not among them."""
+    """One array of a sequence (`layout.ARRAYS`), from the arrays that :func:`encoded` returned.
+
+    Raises:
+        KeyError: The array is not among them.
+    """
     if name in _BOXED:
         return unboxed(*(stored[part] for part in _BOXED[name]))
     if name == "bone_transforms":

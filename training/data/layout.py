@@ -1,7 +1,8 @@
-"""Which arrays a sequence consists of, under which names, types and shapes, and whether they fit each other.
+"""Names, types and shapes of the arrays of a sequence, and the check that they fit each other.
 
-Letters are sizes: T frames; V, F, P vertices, faces and pins of all garments together; U, G vertices and faces of the
-body; B bones, W of which move a vertex; K garments and 1.
+Letters are sizes: T is the number of frames; V, F and P are the numbers of vertices, faces and pins of all garments
+together; U and G are the numbers of vertices and faces of the body; B is the number of bones, W of which move a vertex;
+K is the number of garments plus 1.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ ARRAYS = {
     "body_vertices": "T,U,3",
     "wind": "T,3",  # optional: velocity of the air [m/s]
 }
-"""What a sequence is written from and gives back: names and shapes."""
+"""Arrays from which a sequence is written and which it gives back: names and shapes."""
 
 _INDEX = "uint8 uint16 int32"
 STORED = {
@@ -52,7 +53,7 @@ STORED = {
     "body_boxes": ("float32", "T,2,3"),
     "wind": ("float32", "T,3"),
 }
-"""The files of a sequence: types and shapes. See `encoding` for what the numbers mean."""
+"""Files of a sequence: types and shapes. `encoding` explains the numbers."""
 
 _STORED_1 = {
     "garment_rest_vertices": ("float32", "V,3"),
@@ -77,11 +78,11 @@ AGAIN = "Delete the folder and generate it again."
 
 
 def expected(version: int, present: Collection[str]) -> dict[str, tuple[str, str]]:
-    """The arrays that a sequence must have: types and shapes.
+    """Types and shapes of the arrays that a sequence must have, by name.
 
     Args:
-        version: Format, 1 or 2.
-        present: Names of those that are there: they decide what is optional, and which kind of body it is.
+        version: Version of the format, 1 or 2.
+        present: Names of the arrays that are there. They decide on the kind of body and on optional arrays.
     """
     if version == 1:
         return dict(_STORED_1)
@@ -91,7 +92,13 @@ def expected(version: int, present: Collection[str]) -> dict[str, tuple[str, str
 
 
 def check_fit(where: str, stored: Mapping[str, np.ndarray], schema: Mapping[str, tuple[str, str]]) -> None:
-    """Raises MeshError unless types are as they should be, sizes of the same letter agree, and indices exist."""
+    """Raises MeshError unless all types are right, sizes of the same letter agree, and indices are in range.
+
+    Args:
+        where: Name of the sequence, for error messages.
+        stored: Arrays by name.
+        schema: Types and shapes by name, from :func:`expected`.
+    """
     missing = [name for name in schema if name not in stored]
     if missing:
         raise MeshError(f"{where}: {len(missing)} arrays are missing (first: {missing[0]}). {AGAIN}")
@@ -113,7 +120,7 @@ def check_fit(where: str, stored: Mapping[str, np.ndarray], schema: Mapping[str,
 
 
 def _size(letter: str, sizes: Mapping[str, tuple[int, str]]) -> tuple[int, str] | None:
-    """What a letter of a shape stands for and which array says so; None where none has so far."""
+    """The size that a letter stands for and the array that determines it; None if no array has so far."""
     if letter.isdigit():
         return int(letter), ""
     if letter == "W-1":
@@ -124,7 +131,7 @@ def _size(letter: str, sizes: Mapping[str, tuple[int, str]]) -> tuple[int, str] 
 
 
 def _check_indices(where: str, stored: Mapping[str, np.ndarray], sizes: Mapping[str, int]) -> None:
-    """Raises MeshError where an index names something that is not there, or garments share faces."""
+    """Raises MeshError if an index is out of range or garments share faces."""
     for name, letter in (("garment_faces", "V"), ("pins", "V"), ("body_faces", "U"), ("bone_indices", "B")):
         if name in stored and letter in sizes:
             bad = (stored[name] < 0) | (stored[name] >= sizes[letter])

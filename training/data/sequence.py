@@ -3,7 +3,7 @@
     write_sequence(folder, arrays, manifest)      # arrays in floats (layout.ARRAYS), stored in few bytes (encoding)
     sequence = Sequence.load(folder)              # sequence.garment, .vertices, .body(), .layers, .wind
 
-A body is stored as rest mesh, skinning weights and bone transforms where it has them, else as positions.
+A body with skinning weights and bone transforms is stored as these and a rest mesh, any other body as positions.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = [
 FORMAT = 2
 MANIFEST = "manifest.json"
 _LARGE = ("garment_positions", "body_positions", "garment_vertices")  # mapped; others would cost an open file each
-_OF_FRAMES = (  # of the body, by frame: format 1, then 2
+_OF_FRAMES = (  # arrays of the body with one entry per frame: format 1, then 2
     "bone_transforms", "bone_rotations", "bone_translations", "bone_origins", "body_positions", "body_boxes",
 )  # fmt: skip
 _ONE_OF_TWO_BODIES = {"body_vertices", "bone_transforms"}
@@ -47,9 +47,9 @@ class Layer:
     """One garment of an outfit.
 
     Attributes:
-        name, category: From the manifest.
-        vertices, faces: Which of the sequence's vertices and faces are its own.
-        entry: All that the manifest says of it: name, category, material.
+        name, category: Name and category in the manifest.
+        vertices, faces: Ranges of the garment in the vertices and faces of the sequence.
+        entry: The garment's entry in the manifest: name, category, material.
     """
 
     name: str
@@ -63,8 +63,8 @@ class Sequence:
     """One simulated sequence: garments on a moving body. Read one with :meth:`load`.
 
     Attributes:
-        folder: Where it lies.
-        manifest: Status, split, seed, parameters, figures, checksums.
+        folder: Folder of the sequence.
+        manifest: Status, split, seed, parameters, figures and checksums.
     """
 
     def __init__(self, folder: Path, manifest: dict[str, Any], stored: dict[str, np.ndarray]):
@@ -72,7 +72,7 @@ class Sequence:
 
     @classmethod
     def load(cls, folder: str | Path) -> Sequence:
-        """Reads a sequence. Positions are memory-mapped, and decoded when first asked for.
+        """Reads a sequence. Positions are memory-mapped, and decoded when they are first used.
 
         Raises:
             MeshError: The manifest or an array is missing, damaged, of another type or shape, or does not fit the
@@ -111,7 +111,7 @@ class Sequence:
 
     @cached_property
     def vertices(self) -> np.ndarray:
-        """Garment vertices [m], float32 [T, V, 3]. A frame that was not finite is NaN throughout."""
+        """Garment vertices [m], float32 [T, V, 3]. A frame with a number that was not finite is NaN throughout."""
         return self._array("garment_vertices")
 
     @cached_property
@@ -144,12 +144,12 @@ class Sequence:
 
     @property
     def starts(self) -> np.ndarray:
-        """First vertex of each garment, and the number of all: int [K + 1]."""
+        """First vertex of each of K garments, and the number of all vertices, int [K + 1]."""
         return self._stored.get("garment_starts", np.array([0, len(self._stored["garment_rest_vertices"])]))
 
     @property
     def wind(self) -> np.ndarray | None:
-        """Velocity of the air in each frame [m/s], float32 [T, 3]; None: still air."""
+        """Velocity of the air in each frame [m/s], float32 [T, 3]; None for still air."""
         return self._array("wind") if "wind" in self._stored else None
 
     def full_body(self) -> BodyMotion:
@@ -157,16 +157,16 @@ class Sequence:
         return self.body_in(slice(None))
 
     def body(self) -> BodyMotion:
-        """The faces cloth collides with (no hands and forearms), vertices compacted."""
+        """The part of the body with which cloth collides (without hands and forearms), with its own vertices only."""
         return self.full_body().submesh(self.collider_faces)
 
     @property
     def collider_faces(self) -> np.ndarray:
-        """Which faces of the whole body cloth collides with, bool [G]."""
+        """Mask of the faces of the whole body with which cloth collides, bool [G]."""
         return self._array("collider_faces")
 
     def body_in(self, frames: slice | list[int]) -> BodyMotion:
-        """The whole body in some of the frames; others are not decoded."""
+        """The whole body in the given frames; other frames are not decoded."""
         some = {name: array[frames] if name in _OF_FRAMES else array for name, array in self._stored.items()}
         part = Sequence(self.folder, self.manifest, some)
         if "body_positions" in self._stored:
@@ -177,7 +177,7 @@ class Sequence:
         return BodyMotion(vertices, self._array("body_faces"), self.fps)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything as `write_sequence` takes it, so that a sequence of format 1 can be written anew."""
+        """All arrays in the form that `write_sequence` takes, so that a sequence of format 1 can be written anew."""
         skinned = {"body_rest_vertices", "bone_indices", "bone_weights", "bone_transforms"}
         left_out = skinned if "body_positions" in self._stored else {"body_vertices"}
         left_out |= {name for name in ("garment_starts", "wind") if name not in self._stored}
@@ -192,9 +192,9 @@ class Sequence:
 
 
 def _read(folder: Path, name: str) -> np.ndarray:
-    """One array; copied into memory unless it is large."""
+    """One array, copied into memory unless it is large."""
     try:
-        array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="r")  # refuses whatever is pickled
+        array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="r")  # refuses pickled arrays
     except (OSError, ValueError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MeshError(f"{folder.name}: {name}.npy cannot be read ({reason}). {AGAIN}") from None
@@ -205,7 +205,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a sequence folder.
 
     Raises:
-        MeshError: There is none, or it is not a JSON object.
+        MeshError: There is no manifest, or it is not a JSON object.
     """
     return read_json(Path(folder) / MANIFEST)
 
@@ -214,7 +214,7 @@ def list_sequences(root: str | Path, split: str | None = None, status: str | Non
     """Sequence folders below `root`, sorted by name.
 
     Args:
-        root: The data set's folder.
+        root: Folder of the data set.
         split: "train", "validation" or "test"; None for all.
         status: "good" or "rejected"; None for both.
 
@@ -224,21 +224,22 @@ def list_sequences(root: str | Path, split: str | None = None, status: str | Non
     root = Path(root)
     if not root.is_dir():
         raise FileNotFoundError(f"no data set at {root}: make one with `warpgarment generate --out {root}`")
-    found = []
+    folders = []
     for path in sorted(root.glob(f"[!.]*/{MANIFEST}")):
         manifest = read_manifest(path.parent)
         if (split is None or manifest.get("split") == split) and (status is None or manifest.get("status") == status):
-            found.append(path.parent)
-    return found
+            folders.append(path.parent)
+    return folders
 
 
 def write_sequence(folder: Path, arrays: Mapping[str, np.ndarray], manifest: Mapping[str, Any]) -> None:
     """Writes a sequence beside its final place and moves it there, so that it is whole or absent.
 
     Args:
-        folder: Where to; must not exist.
-        arrays: See `layout.ARRAYS`. A rejected sequence may have none; its manifest keeps parameters and reason.
-        manifest: Anything JSON knows; `format` and `checksums` (sha256 of every file) are added.
+        folder: Folder of the sequence, which must not exist.
+        arrays: Arrays by name, with the shapes of `layout.ARRAYS`. A rejected sequence may have none; its manifest
+            keeps the parameters and the reason.
+        manifest: Entries of the manifest, in types of JSON; `format` and `checksums` (sha256 of every file) are added.
 
     Raises:
         FileExistsError: The folder exists.

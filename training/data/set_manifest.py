@@ -1,4 +1,4 @@
-"""`set.json`: what all sequences of a data set have in common, so that two sets are never mixed in one folder."""
+"""`set.json`: the options common to all sequences of a data set, so that two sets are never mixed in one folder."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ def write_set_manifest(
     command: str = "",
     versions: Mapping[str, str | None] | None = None,
 ) -> dict[str, Any]:
-    """Writes what all sequences of a set have in common, or checks that it is what is written there already.
+    """Writes the options common to all sequences of a set, or checks that they agree with an existing `set.json`.
 
     Args:
-        root: The data set's folder; made if missing.
-        configuration: What determines the sequences, as plain values; of these, `recipe`, `seed` and `held_out`
-            (categories that are only tested on) are known to `verify` and `card`.
-        teacher: The teacher's settings, as plain values.
-        numbers: Of the sequences planned; they join those that were planned before.
-        command: Makes the set again.
-        versions: Of packages; by default of those that data are made with.
+        root: Folder of the data set; it is made if it is missing.
+        configuration: Options that determine the sequences, as plain values; `verify` and `card` read `recipe`, `seed`
+            and `held_out` (categories that are only tested on).
+        teacher: Settings of the teacher, as plain values.
+        numbers: Numbers of the planned sequences; they are added to those that were planned before.
+        command: Command that makes the set again.
+        versions: Versions of packages by name; None for the installed versions of those that data are made with.
 
     Returns:
-        The manifest as it lies in the folder.
+        The manifest as it is in the folder.
 
     Raises:
-        DatasetMismatch: The set there has another configuration or teacher; names the fields.
-        MeshError: What is there is damaged.
+        DatasetMismatch: The set in the folder has another configuration or teacher; the error names the fields.
+        MeshError: The manifest in the folder is damaged.
     """
     content = {
         "configuration": dict(configuration),
@@ -52,7 +52,7 @@ def write_set_manifest(
         "versions": package_versions() if versions is None else dict(versions),
         "command": command,
     }
-    new: dict[str, Any] = json.loads(json.dumps(content))  # as it will be read: tuples are lists
+    new: dict[str, Any] = json.loads(json.dumps(content))  # in the types of the file, where tuples are lists
     planned = set(numbers)
     old = read_set_manifest(root)
     if old is not None:
@@ -85,10 +85,10 @@ def _short(value: Any) -> str:
 
 
 def read_set_manifest(root: str | Path) -> dict[str, Any] | None:
-    """What `write_set_manifest` wrote; None where the folder has none.
+    """The manifest that `write_set_manifest` wrote; None if the folder has none.
 
     Raises:
-        MeshError: It is damaged.
+        MeshError: The manifest is damaged.
     """
     path = Path(root) / SET_MANIFEST
     return read_json(path) if path.exists() else None
@@ -111,7 +111,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def planned_numbers(manifest: Mapping[str, Any]) -> list[int]:
-    """Numbers of all sequences that were planned so far."""
+    """Numbers of all sequences planned so far."""
     return [n for first, last in manifest.get("numbers", []) for n in range(first, last + 1)]
 
 
@@ -127,7 +127,7 @@ def _ranges(numbers: Iterable[int]) -> list[list[int]]:
 
 
 def package_versions(names: Iterable[str] = PACKAGES) -> dict[str, str | None]:
-    """Installed versions of packages, None where one is not installed."""
+    """Installed versions of packages by name, None for a package that is not installed."""
     return {name: _version(name) for name in names}
 
 

@@ -1,4 +1,4 @@
-"""Which split a sequence and a motion clip belong to: by number and by name, so that they never change."""
+"""Splits of sequences and motion clips. They follow from number and name alone, so that they never change."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ SPLITS = ("train", "validation", "test")
 
 
 def split_of_number(number: int) -> str:
-    """Which split a sequence belongs to: of 24, three are for testing and one for validation (200 : 10 : 30 of 240)."""
+    """The split of a sequence: of 24, three are for testing and one is for validation (200 : 10 : 30 of 240)."""
     return "test" if number % 8 == 3 else "validation" if number % 24 == 5 else "train"
 
 
 def clip_group(name: str) -> str:
-    """Clips of the same performance share a group: the two partners of a salsa are numbered 01-15 and 16-30."""
+    """The performance of a clip, whose clips share a group: two partners of a salsa are numbered 01-15 and 16-30."""
     salsa = re.search(r"salsa_(\d+)", name)
     return f"salsa_{(int(salsa.group(1)) - 1) % 15 + 1:02d}" if salsa else name
 

@@ -1,9 +1,9 @@
-"""Is a data set whole, unchanged, and split as it should be? `warpgarment dataset verify DIR`
+"""Checks whether a data set is complete, unchanged and correctly split: `warpgarment dataset verify DIR`.
 
-Every sequence: the manifest says what it must, every file has its checksum, arrays fit each other, values are finite,
-the rest mesh is one that a garment can have. The set: no two sequences of one number, none missing of those planned,
-none of another seed, no clip (or clip of the same performance) and no garment both trained and tested on, no held-out
-category trained on, nothing unfinished left behind.
+In every sequence the manifest has all its entries, every file has its checksum, arrays fit each other, values are
+finite, and the rest mesh is valid for a garment. In the set no number occurs twice, no planned sequence is missing, no
+sequence has another seed, no clip (or clip of the same performance) and no garment is both trained and tested on, no
+held-out category is trained on, and there are no unfinished sequences.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from .layout import SPLITS
 from .sequence import MANIFEST, Sequence, read_manifest
 from .set_manifest import planned_numbers, read_set_manifest
 
-NOT_SEQUENCES = ("card",)  # folders that a set may hold besides
-_HELD_OUT_BY_CATEGORY = ("cloth3d",)  # recipes; outfits and cuts are split otherwise
+NOT_SEQUENCES = ("card",)  # other folders that a set may hold
+_HELD_OUT_BY_CATEGORY = ("cloth3d",)  # recipes with held-out categories; outfits and cuts are split otherwise
 
 
 class VerificationFailed(ValueError):
@@ -35,7 +35,7 @@ class VerificationFailed(ValueError):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is wrong, and where: a sequence's folder, or a file or folder of the set."""
+    """A fault (`what`) and its place (`where`): a sequence's folder, or a file or folder of the set."""
 
     where: str
     what: str
@@ -43,14 +43,14 @@ class Problem:
 
 @dataclass(frozen=True)
 class Entry:
-    """What is known about a sequence.
+    """The facts about one sequence.
 
     Attributes:
-        name: Its folder.
-        manifest: Empty where it cannot be read.
-        size: Bytes on disk.
-        garments: A fingerprint of the rest mesh of each garment; empty where it could not be read.
-        problems: What is wrong with it.
+        name: Name of its folder.
+        manifest: Its manifest; empty if it cannot be read.
+        size: Size on disk [bytes].
+        garments: A fingerprint of the rest mesh of each garment; empty if they could not be read.
+        problems: Faults of the sequence.
     """
 
     name: str
@@ -65,11 +65,13 @@ class Report:
     """Result of :func:`verify`.
 
     Attributes:
-        root: The folder's name.
-        sequences, rejected, frames, size: Good and rejected sequences, frames of the good ones, bytes of the set.
-        rejected_attempts: How often a sequence was rejected and drawn anew.
-        splits: Good sequences, frames, and sequences by category, of each split.
-        problems: Everything that is wrong.
+        root: Name of the folder.
+        sequences, rejected: Number of good and of rejected sequences.
+        frames: Number of frames of the good sequences.
+        size: Size of the set on disk [bytes].
+        rejected_attempts: Number of times that a sequence was rejected and drawn anew.
+        splits: Number of good sequences, of their frames, and of sequences by category, for each split.
+        problems: All faults of the set.
     """
 
     root: str
@@ -82,7 +84,7 @@ class Report:
     problems: list[Problem] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """The attributes as plain values."""
         return asdict(self)
 
     def __str__(self) -> str:
@@ -131,14 +133,14 @@ def verify(root: str | Path) -> Report:
 
 
 def check_sequence(folder: Path) -> Entry:
-    """Reads one sequence completely and says what is wrong with it."""
+    """Reads one sequence completely and lists its faults."""
     try:
         size = sum(p.stat().st_size for p in folder.iterdir() if p.is_file())
         manifest = read_manifest(folder)
     except (MeshError, OSError) as error:
         return Entry(folder.name, {}, 0, (), (Problem(folder.name, str(error)),))
     problems = _manifest_problems(manifest)
-    if problems:  # nothing it says can be counted on
+    if problems:  # the entries of this manifest are not reliable
         return Entry(folder.name, {}, size, (), tuple(Problem(folder.name, p) for p in problems))
     problems = _file_problems(folder, manifest)
     garments: tuple[str, ...] = ()
@@ -151,7 +153,7 @@ def check_sequence(folder: Path) -> Entry:
 
 
 def _manifest_problems(manifest: dict[str, Any]) -> list[str]:
-    """What a manifest must say, and does not."""
+    """Entries that a manifest must have and lacks."""
 
     def text(value: Any) -> bool:
         return isinstance(value, str) and bool(value)
@@ -206,7 +208,7 @@ def _content(sequence: Sequence) -> tuple[str, ...]:
     """Fingerprints of the garments of a sequence whose arrays are sound.
 
     Raises:
-        MeshError: They are not; says what is wrong.
+        MeshError: The arrays are not sound; the message names the fault.
     """
     if len(sequence) != sequence.manifest["frames"]:
         raise MeshError(f"{len(sequence)} frames, {MANIFEST} says {sequence.manifest['frames']}")
@@ -227,7 +229,7 @@ def _content(sequence: Sequence) -> tuple[str, ...]:
 
 
 def _numbers(entries: list[Entry], manifest: dict[str, Any]) -> Iterable[Problem]:
-    """Sequences that are there twice, or missing, or of another seed."""
+    """Sequences that exist twice, are missing, or have another seed."""
     count = Counter(entry.manifest["number"] for entry in entries if "number" in entry.manifest)
     for entry in entries:
         if count[entry.manifest.get("number")] > 1:
@@ -243,7 +245,7 @@ def _numbers(entries: list[Entry], manifest: dict[str, Any]) -> Iterable[Problem
 
 
 def _splits(entries: list[Entry]) -> Iterable[Problem]:
-    """Clips and garments both trained and tested on."""
+    """Clips and garments that are both trained and tested on."""
     from .splits import clip_group
 
     clips: dict[str, str] = {}
@@ -260,13 +262,13 @@ def _splits(entries: list[Entry]) -> Iterable[Problem]:
 
 
 def _held_out(entries: list[Entry], manifest: dict[str, Any]) -> Iterable[Problem]:
-    """Categories trained on that are only to be tested on."""
+    """Held-out categories, only for testing, that are trained on."""
     configuration = manifest.get("configuration", {})
     if configuration.get("recipe", "cloth3d") in _HELD_OUT_BY_CATEGORY:
         for entry in _good(entries, "train"):
-            found = set(_categories(entry.manifest)) & set(configuration.get("held_out", []))
-            if found:
-                yield Problem(entry.name, f"trains on {', '.join(sorted(found))}, held out for tests")
+            held_out = set(_categories(entry.manifest)) & set(configuration.get("held_out", []))
+            if held_out:
+                yield Problem(entry.name, f"trains on {', '.join(sorted(held_out))}, held out for tests")
 
 
 def _good(entries: list[Entry], split: str) -> list[Entry]:

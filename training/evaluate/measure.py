@@ -4,12 +4,12 @@
     warpgarment evaluate --table table1 --data sequences --steps 20000      # one of the paper's tables, see `tables`
 
 Every sequence is rolled out autoregressively twice: **warm**, from its first ten recorded frames, and **cold**, from
-the first alone. Only predicted frames count. Baselines start from the newest frame that the network saw. Pins are
-tied to the body's surface where they were in the first frame the method saw, as in any simulation; nothing recorded
-is used after the start.
+the first alone. Only predicted frames count. Baselines start from the newest input frame of the network. Pins are tied
+to the body's surface at their places in the first input frame, as in any simulation; no recorded frame is used after
+the start.
 
-Writes `evaluation.json`, `evaluation.md` and `error_over_time.png`, each complete or not at all. The tables measure in
-the same way, with `measure`.
+The results are `evaluation.json`, `evaluation.md` and `error_over_time.png`, each written completely or not at all. The
+tables use the same function `measure`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from warpgarment.training.train.training_set import folders_of
 
 
 class NoTestData(ValueError):
-    """No sequence could be evaluated; the message says why."""
+    """No sequence could be evaluated; the message has the reasons."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,9 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         `seconds_per_frame`; for tables what `tables.make_table` returns.
 
     Raises:
-        OptionMissing: No data or no out folder.
-        NoTestData: Nothing to evaluate.
-        CheckpointError: No such network.
+        OptionMissing: There are no data or no output folder.
+        NoTestData: No sequence can be evaluated.
+        CheckpointError: The network does not exist or cannot be read.
         MissingExtra: A picture is wanted and matplotlib is missing.
     """
     if config.threads:
@@ -112,34 +112,41 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
     simulator = Simulator(checkpoint.load(path), config.device)
     skipped: dict[str, str] = {}
     folders = evenly(folders_of(Path(config.data), config.split, skipped), config.max_sequences)
-    found = measure(
+    measured = measure(
         simulator,
         folders,
         frames=config.frames,
         geodesic_frames=config.geodesic_frames,
         baselines=config.baselines,
     )
-    skipped |= found.skipped
-    if not found.rows:
+    skipped |= measured.skipped
+    if not measured.rows:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(skipped.items())[:3])
         raise NoTestData(f"{config.data}: no {config.split} sequence to evaluate ({reasons or 'none found'})")
     settings = {k: v for k, v in vars(config).items() if k not in ("table", "tables")}
     result = {
-        "settings": {k: v.name if isinstance(v, Path) else v for k, v in settings.items()},  # results travel
+        "settings": {k: v.name if isinstance(v, Path) else v for k, v in settings.items()},  # without private folders
         "network": _describe(path, simulator),
-        "frames_predicted": found.frames,
-        "seconds_per_frame": found.seconds / max(found.frames, 1),
-        "mean": means(found.rows),
-        "sequences": found.rows,
+        "frames_predicted": measured.frames,
+        "seconds_per_frame": measured.seconds / max(measured.frames, 1),
+        "mean": means(measured.rows),
+        "sequences": measured.rows,
         "skipped": skipped,
         "skipped_count": len(skipped),
     }
-    write(Path(config.out), result, found.curves, picture=config.picture)
+    write(Path(config.out), result, measured.curves, picture=config.picture)
     return result
 
 
 def write(out: Path, result: dict[str, Any], curves: dict[tuple[str, str], list[np.ndarray]], *, picture: bool) -> None:
-    """Writes the result files, each under another name first."""
+    """Writes the result files, each completely or not at all.
+
+    Args:
+        out: Folder of the files.
+        result: Result of :func:`evaluate`.
+        curves: (method, start) -> error over time [cm], one array per sequence.
+        picture: Whether the picture is drawn.
+    """
     with atomic_file(out / "evaluation.json") as path:
         path.write_text(json.dumps(plain(result), indent=1), "utf-8")
     with atomic_file(out / "evaluation.md") as path:
@@ -150,7 +157,7 @@ def write(out: Path, result: dict[str, Any], curves: dict[tuple[str, str], list[
 
 
 def table(result: dict[str, Any]) -> str:
-    """The result as Markdown: means first, then every sequence."""
+    """The result as Markdown: the means, then every sequence."""
     lines = [
         "# Evaluation",
         "",
@@ -177,20 +184,25 @@ def table(result: dict[str, Any]) -> str:
 
 
 def draw(path: Path, curves: dict[tuple[str, str], list[np.ndarray]]) -> None:
-    """Error over time: mean over the sequences that last so long, one curve per method, one panel per start."""
+    """Draws the mean error over time of the sequences that are long enough: a curve per method, a panel per start.
+
+    Args:
+        path: PNG file to write.
+        curves: (method, start) -> error over time [cm], one array per sequence.
+    """
     pyplot = _pyplot()
     figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), sharey=True, constrained_layout=True)
     for axis, start in zip(axes, STARTS, strict=True):
         for method in METHODS:
-            found = curves.get((method, start), [])
-            if not found:
+            errors = curves.get((method, start), [])
+            if not errors:
                 continue
-            padded = np.full((len(found), max(map(len, found))), np.nan)
-            for i, curve in enumerate(found):
+            padded = np.full((len(errors), max(map(len, errors))), np.nan)
+            for i, curve in enumerate(errors):
                 padded[i, : len(curve)] = curve
             counted = np.maximum(np.isfinite(padded).sum(axis=0), 1)
             mean = np.where(np.isfinite(padded).any(axis=0), np.nansum(padded, axis=0) / counted, np.nan)
-            axis.plot(np.arange(1, len(mean) + 1), mean, label=f"{method} ({len(found)})")
+            axis.plot(np.arange(1, len(mean) + 1), mean, label=f"{method} ({len(errors)})")
         axis.set(title=f"{start} start", xlabel="predicted frame")
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("mean vertex error [cm]")

@@ -1,9 +1,9 @@
-"""A page about a trained network, with its failures as pictures, chosen by a rule that the page prints.
+"""A page about a trained network, with pictures of rollouts that include its failures, chosen by a printed rule.
 
     python -m warpgarment.training.evaluate.model_card --data sequences --network out/run/best.safetensors \\
         --evaluation out/evaluation/evaluation.json --out out/card
 
-Writes `card.md` and `card/*.png`: what the network is, the data, the training and its curves (from the run's
+The page, `card.md` with `card/*.png`, describes the network, the data, the training and its curves (from the run's
 `log.jsonl`), the figures of an evaluation by start, method and category, and rollouts beside the teacher's, chosen by
 `RULE`.
 """
@@ -37,11 +37,11 @@ RULE = (
     "are the first, the median (of an even number the better one) and the last two, each at the frames of largest "
     "error that are at least half a second apart; the network above, the teacher below."
 )
-APART = 0.5  # seconds between the frames that are drawn
+APART = 0.5  # least time between the frames that are drawn [s]
 
 
 class CardError(ValueError):
-    """The page cannot be written from these files; the message says which and why."""
+    """The page cannot be written from these files; the message names the file and the reason."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +70,15 @@ class ModelCardConfig:
 
 
 def write_card(config: ModelCardConfig) -> Path:
-    """Writes the page.
+    """Writes the page and its pictures.
 
     Returns:
-        `card.md`.
+        Path of `card.md`.
 
     Raises:
         CardError: The evaluation is damaged, of another network, without baselines, or of other sequences.
-        CheckpointError: No such network.
-        MissingExtra: Pictures need `pip install "warpgarment[view]"`.
+        CheckpointError: The network does not exist or cannot be read.
+        MissingExtra: The extra for pictures is not installed (`pip install "warpgarment[view]"`).
     """
     path = checkpoint.find(config.network, device=config.device)
     network = checkpoint.load(path)
@@ -103,10 +103,10 @@ def write_card(config: ModelCardConfig) -> Path:
 
 
 def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, Any]) -> dict[str, Any]:
-    """The result of `evaluate`, if it is of the network with this config and these notes.
+    """The result of `evaluate`, after a check that it is of the network with this configuration and these notes.
 
     Raises:
-        CardError: It is not, or damaged.
+        CardError: The result is of another network, or damaged.
     """
     try:
         result = json.loads(Path(path).read_text("utf-8"))
@@ -114,7 +114,7 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
         rows = [row for row in result["sequences"] if row["start"] == "cold" and row["network"] is not None]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CardError(f"{path}: no result of an evaluation ({type(error).__name__}: {error})") from error
-    # A setting that came later has its default in what was written before
+    # A setting that was introduced later has its default value in older files.
     settings = {f.name: f.default for f in dataclasses.fields(NetworkConfig)} | dict(about.get("config") or {})
     if settings != dict(config) or about.get("notes") != dict(notes):
         raise CardError(
@@ -126,9 +126,9 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """Lines of a training's log, by step; of those that a resumed run wrote again, the later. A torn line is left
-    out."""
-    found: dict[tuple[int, bool], dict[str, Any]] = {}
+    """Lines of a training log by step. Of lines that a resumed run wrote again, the later ones count; a torn line is
+    left out."""
+    entries: dict[tuple[int, bool], dict[str, Any]] = {}
     for line in path.read_text("utf-8").splitlines():
         try:
             entry = json.loads(line)
@@ -137,18 +137,18 @@ def read_log(path: Path) -> list[dict[str, Any]]:
         if isinstance(entry, dict) and isinstance(entry.get("step"), int):
             for kind in ("loss", "rollout_error_cm"):
                 if kind in entry:
-                    found[entry["step"], kind == "loss"] = entry
-    return [found[key] for key in sorted(found)]
+                    entries[entry["step"], kind == "loss"] = entry
+    return [entries[key] for key in sorted(entries)]
 
 
 def chosen(rows: Sequence[Mapping[str, Any]]) -> list[Case]:
     """The best, the median, the second worst and the worst of the cold starts, by `RULE`.
 
     Args:
-        rows: Of an evaluation.
+        rows: Rows of an evaluation, one per sequence and start.
 
     Returns:
-        Best first, each sequence once; one that has several roles bears them all.
+        Cases from best to worst; a sequence with several roles is one case with all of them.
     """
     order = sorted((row for row in rows if row["start"] == "cold"), key=lambda row: (ratio(row), row["sequence"]))
     last = len(order) - 1
@@ -159,10 +159,15 @@ def chosen(rows: Sequence[Mapping[str, Any]]) -> list[Case]:
 
 
 def largest(errors: np.ndarray, count: int, apart: int) -> list[int]:
-    """Where errors are largest: at most `count` places, each at least `apart` from the others; NaN does not count.
+    """Places of the largest errors.
+
+    Args:
+        errors: Errors, [T]; NaN does not count.
+        count: Largest number of places.
+        apart: Least distance between two places.
 
     Returns:
-        Indices, ascending.
+        Indices into the errors, ascending.
     """
     left = np.where(np.isfinite(errors), errors, -np.inf)
     places: list[int] = []
@@ -174,7 +179,7 @@ def largest(errors: np.ndarray, count: int, apart: int) -> list[int]:
 
 
 def _draw(path: Path, case: Case, config: ModelCardConfig, simulator: Simulator) -> Drawn:
-    """Rolls a sequence out again, as it was evaluated, and draws it."""
+    """Rolls a sequence out again, as in the evaluation, and draws it."""
     folder = Path(config.data) / str(case.row["sequence"])
     if not folder.is_dir():
         raise CardError(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-AGREE = 0.05  # a rollout made again is expected to have the error it had before, up to this share
+AGREE = 0.05  # largest relative difference between the error of a repeated rollout and that of the evaluation
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class Case:
     """A sequence that is drawn.
 
     Attributes:
-        role: "best", "median", "second worst", "worst", or several of them where there are few sequences.
-        row: Its row of the evaluation, from a cold start.
-        ratio: Of the network's error to the skinned garment's; infinite where the network's rollout failed.
+        role: "best", "median", "second worst", "worst", or several of them if there are few sequences.
+        row: Row of the sequence in the evaluation, from a cold start.
+        ratio: Ratio of the network's error to that of the skinned garment; infinite if the network's rollout failed.
     """
 
     role: str
@@ -28,15 +28,17 @@ class Case:
 
     @property
     def file(self) -> str:
-        """Name of its picture."""
+        """File name of the picture."""
         return self.role.split(",")[0].replace(" ", "_") + ".png"
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A case as it was rolled out again: frames of the sequence that are drawn, and errors [cm] of all predicted ones.
+    """A case that was rolled out again, with `moments`, the frames that are drawn, and `errors` of all predicted frames
+    [cm].
 
-    `errors[k]` belongs to frame k + 1, since frame 0 is given; NaN from where a rollout failed.
+    `errors[k]` belongs to frame k + 1, since frame 0 is given. Errors are NaN from the frame on in which a rollout
+    failed.
     """
 
     case: Case
@@ -45,12 +47,12 @@ class Drawn:
 
     @property
     def error(self) -> float:
-        """Mean over the predicted frames [cm]; NaN for a rollout that failed."""
+        """Mean error over the predicted frames [cm]; NaN for a rollout that failed."""
         return float(self.errors.mean())
 
     @property
     def differs(self) -> bool:
-        """Whether this is not the rollout that was evaluated."""
+        """Whether the error differs from that of the evaluated rollout by more than `AGREE`."""
         before = self.case.row["network"].get("mean_vertex_error_cm")
         before = math.nan if before is None else before
         return not (math.isnan(self.error) and math.isnan(before)) and not abs(self.error - before) <= AGREE * before

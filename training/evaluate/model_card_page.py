@@ -36,14 +36,14 @@ def page(
     """The text of the page.
 
     Args:
-        name: Of the checkpoint.
-        network: Whose page it is.
-        notes: Of its checkpoint.
+        name: Name of the checkpoint.
+        network: Network that the page describes.
+        notes: Notes of its checkpoint.
         evaluation: Result of `evaluate`.
-        facts: Manifests of the data it was evaluated on.
+        facts: Manifests of the data of the evaluation.
         drawn: Sequences that are shown.
-        log: Of the training; empty where there is no picture of it.
-        rule: By which they were chosen.
+        log: Lines of the training log; empty if there is no picture of it.
+        rule: Rule by which the sequences were chosen.
     """
     return (
         "\n".join(
@@ -75,9 +75,9 @@ def page(
 
 
 def ratio(row: Mapping[str, Any]) -> float:
-    """Of the network's error to the skinned garment's; infinite where the network's rollout failed."""
-    mine, other = (row[method].get("mean_vertex_error_cm") for method in ("network", "skinned"))
-    return mine / other if mine is not None and other and row["network"]["finite"] else math.inf
+    """Ratio of the network's error to that of the skinned garment; infinite if the network's rollout failed."""
+    error, reference = (row[method].get("mean_vertex_error_cm") for method in ("network", "skinned"))
+    return error / reference if error is not None and reference and row["network"]["finite"] else math.inf
 
 
 def _data(notes: Mapping[str, Any], facts: Facts) -> list[str]:
@@ -120,12 +120,12 @@ def _figures(evaluation: Mapping[str, Any]) -> list[str]:
         [
             start,
             method,
-            *map(_cell, [found] * len(FIGURES), FIGURES),
-            found.get("sequences", ""),
-            found.get("failed", ""),
+            *map(_cell, [figures] * len(FIGURES), FIGURES),
+            figures.get("sequences", ""),
+            figures.get("failed", ""),
         ]
         for start in starts
-        for method, found in mean[start].items()
+        for method, figures in mean[start].items()
     ]
     lines += [*table(headings, body), "Mean vertex error [cm] by category:", ""]
     methods = [method for method in METHODS if any(method in row for row in rows)]
@@ -162,19 +162,19 @@ def _cases(rows: Sequence[Mapping[str, Any]], drawn: Sequence[Drawn], rule: str)
         ]
         if shown.differs:
             before = row["network"].get(_ERROR)
-            told = "failed" if before is None else f"gave {before:.2f} cm"
-            lines += [f"Rolled out again for the picture; when it was evaluated it {told}.", ""]
+            outcome = "failed" if before is None else f"gave {before:.2f} cm"
+            lines += [f"Rolled out again for the picture; when it was evaluated it {outcome}.", ""]
         lines += [f"![{case.role}: {row['sequence']}](card/{case.file})", ""]
     return lines
 
 
-def _cell(found: Mapping[str, Any], key: str) -> str:
-    value = found.get(key)
+def _cell(figures: Mapping[str, Any], key: str) -> str:
+    value = figures.get(key)
     return "-" if value is None else FIGURES[key][1].format(value * _SCALE.get(key, 1.0))
 
 
 def _mean(values: Iterable[float | None]) -> str:
-    """Of those that are finite, with the number of those that are not."""
+    """Mean of the finite values as text, with the number of those that are not finite."""
     everything = list(values)
     good = [value for value in everything if value is not None and math.isfinite(value)]
     failed = len(everything) - len(good)
@@ -183,7 +183,7 @@ def _mean(values: Iterable[float | None]) -> str:
 
 
 def _flat(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings of groups as group.name."""
+    """Settings with their values; a setting in a group has the name group.name."""
     for key, value in settings.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{before}{key}.")

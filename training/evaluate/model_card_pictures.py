@@ -18,7 +18,7 @@ from warpgarment.view import draw
 if TYPE_CHECKING:
     from .model_card_cases import Drawn
 
-LARGEST = 400_000  # bytes of a picture
+LARGEST = 400_000  # largest file of a picture [bytes]
 
 
 def rollout_sheet(
@@ -30,14 +30,14 @@ def rollout_sheet(
     *,
     size: tuple[int, int],
 ) -> None:
-    """Draws the network's rollout above the teacher's, at some frames; smaller where the file would be too large.
+    """Draws the network's rollout above the teacher's, at some frames; pictures shrink if the file would be too large.
 
     Args:
-        path: PNG to write.
-        sequence: With its body.
-        moved: By the network [m], [T,V,3], NaN where it failed.
-        truth: By the teacher [m], [T,V,3].
-        drawn: Which frames, and the errors to write beside them.
+        path: PNG file to write.
+        sequence: Sequence with its body.
+        moved: Positions by the network [m], [T,V,3], NaN where it failed.
+        truth: Positions by the teacher [m], [T,V,3].
+        drawn: Frames to draw, and errors to write beside them.
         size: Width and height of a picture in pixels.
     """
     body = sequence.body_in(slice(0, len(truth)))
@@ -58,7 +58,7 @@ def _sheet(
 ) -> np.ndarray:
     faces, fps = sequence.garment.faces, sequence.fps
     network, teacher = (GarmentMotion(vertices, faces, fps) for vertices in (moved, truth))
-    camera = draw.chase([body, teacher], size=size)  # not the network, which may have left
+    camera = draw.chase([body, teacher], size=size)  # without the network, whose garment may have moved away
     strips = []
     for motion, color, caption in ((network, draw.CORAL, "{e:.1f} cm"), (teacher, draw.SLATE, "{s:.1f} s")):
         panels = draw.film(body, [motion], size=size, colors=[color], frames=drawn.moments, camera=camera)
@@ -79,15 +79,15 @@ def curves(path: Path, lines: Sequence[Mapping[str, Any]]) -> bool:
     """Draws the training loss and the validation error over the steps.
 
     Args:
-        path: PNG to write.
-        lines: Of a training's log, by step.
+        path: PNG file to write.
+        lines: Lines of a training log by step.
 
     Returns:
         Whether there was anything to draw.
     """
     wanted = {"loss": "training loss", "rollout_error_cm": "validation: error of rollouts [cm]"}
     points = {key: [(line["step"], line[key]) for line in lines if _is_number(line.get(key))] for key in wanted}
-    points = {key: found for key, found in points.items() if found}
+    points = {key: series for key, series in points.items() if series}
     if not points:
         return False
     try:
@@ -95,9 +95,9 @@ def curves(path: Path, lines: Sequence[Mapping[str, Any]]) -> bool:
     except ImportError as error:
         raise MissingExtra("view", "Drawing the curves of a training") from error
     figure = Figure(figsize=(4.2 * len(points), 2.8), layout="constrained")
-    for axis, (key, found) in zip(np.atleast_1d(figure.subplots(1, len(points))), points.items(), strict=True):
-        steps, values = np.array(found, float).T
-        axis.plot(steps, values, color=draw.TEAL, linewidth=1.0, marker="." if len(found) < 60 else None)
+    for axis, (key, series) in zip(np.atleast_1d(figure.subplots(1, len(points))), points.items(), strict=True):
+        steps, values = np.array(series, float).T
+        axis.plot(steps, values, color=draw.TEAL, linewidth=1.0, marker="." if len(series) < 60 else None)
         axis.set_title(wanted[key], fontsize=9)
         axis.set_xlabel("step", fontsize=8)
         axis.tick_params(labelsize=7)

@@ -1,4 +1,4 @@
-"""What a garment must satisfy before it is simulated, beyond being an oriented manifold."""
+"""Requirements on a garment before it is simulated, besides being an oriented manifold."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ _LOOPS = {"tshirt": 4, "top": 4, "dress": 4, "jumpsuit": 5, "trousers": 3, "skir
 
 
 def expected_loops(pattern: Pattern) -> int:
-    """Boundary loops of a garment: hem or legs, neck, sleeves or armholes; a jacket's opening joins hem and neck."""
+    """Number of boundary loops: hem or legs, neck, sleeves or armholes; a jacket's opening joins hem and neck."""
     if pattern.neckline == "strapless" and pattern.category in ("top", "dress", "jumpsuit"):
         return _LOOPS[pattern.category] - 2
     return _LOOPS[pattern.category]
 
 
 def faults(garment: Garment, body: RestBody, pattern: Pattern, gap: float) -> list[str]:
-    """What is wrong with a garment as the start of a simulation; empty when nothing is.
+    """Faults of a garment as the start of a simulation; empty if there are none.
 
     Args:
-        garment: On the body in its rest pose.
+        garment: Garment on the body in its rest pose.
         body: The body.
-        pattern: What the garment was made from.
-        gap: Least distance from the body it was made with [m].
+        pattern: Pattern from which the garment was made.
+        gap: Least distance from the body with which the garment was made [m].
     """
-    found = []
+    errors = []
     loops, expected = len(boundary_loops(garment.faces)), expected_loops(pattern)
     euler = len(garment.vertices) - len(garment.edges) + len(garment.faces)
     if garment.components[2] != 1:
-        found.append(f"{garment.components[2]} pieces instead of one")
+        errors.append(f"{garment.components[2]} pieces instead of one")
     elif loops != expected:
-        found.append(f"{loops} boundary loops instead of {expected}")
+        errors.append(f"{loops} boundary loops instead of {expected}")
     elif euler != 2 - loops:  # a sphere with `loops` holes
-        found.append(f"{(2 - loops - euler) // 2} handles")
+        errors.append(f"{(2 - loops - euler) // 2} handles")
     points = garment.vertices.astype(np.float64)
     distance = igl.signed_distance(
         points, body.vertices, body.faces.astype(np.int64), sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
     )[0]
     if distance.min() < 0.8 * gap:
-        found.append(f"{int((distance < 0.8 * gap).sum()):,} vertices are nearer to the body than {gap * 1e3:.0f} mm")
+        errors.append(f"{int((distance < 0.8 * gap).sum()):,} vertices are nearer to the body than {gap * 1e3:.0f} mm")
     crossings = int(Sheet(garment.faces).self_crossings(garment.vertices).sum())
     if crossings:
-        found.append(f"{crossings:,} pairs of its faces cross")
-    return found
+        errors.append(f"{crossings:,} pairs of its faces cross")
+    return errors

@@ -1,9 +1,9 @@
-"""How the layers of an outfit lie over each other: what has gone through, how many triangles cross, how deep.
+"""Collisions between the layers of an outfit: vertices that have gone through, triangles that cross, depth.
 
-Garments are open sheets, so nothing is inside them by winding number. A point lies *behind* a sheet where its closest
-point is in the sheet's interior (not on its border), no further than a reach, and on the back of the surface there, by
-the angle-weighted normal (Baerentzen and Aanaes 2005). Past the border, as with a coat longer than the shirt below it,
-the two sides are not defined; beyond the reach, a point is another part of the outfit's business.
+Garments are open sheets, so winding numbers do not define an inside. A point lies *behind* a sheet if its closest point
+is in the sheet's interior (not on its border), no further away than a reach, and the point is at the back of the
+surface there, by the angle-weighted normal (Baerentzen and Aanaes 2005). Past the border, as for a coat longer than the
+shirt below it, the two sides are not defined; beyond the reach, the point belongs to another part of the outfit.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ def _count_crossings(
     # Out:
     count: wp.array[int],
 ):
-    """Faces of `other` that each triangle crosses; `same`: both are one mesh, neighbours and pairs seen before do not
-    count. In millimetres, because the test takes distance times area below 1e-6 for zero."""
+    """Number of faces of `other` that each triangle crosses; with `same`, both are one mesh, and neighbours and pairs
+    seen before do not count. Positions are in millimetres, because the test takes distance times area below 1e-6 for
+    zero."""
     t = wp.tid()
     i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
     a, b, c = points[i], points[j], points[k]
@@ -61,10 +62,10 @@ def _count_crossings(
 
 
 class Sheet:
-    """The connectivity of an open surface, prepared for asking about many of its shapes.
+    """The connectivity of an open surface, prepared for queries about many of its shapes.
 
     Args:
-        faces: Counter-clockwise seen from outside, shape [F, 3].
+        faces: Vertex indices, counter-clockwise seen from outside, shape [F, 3].
     """
 
     def __init__(self, faces: np.ndarray):
@@ -79,11 +80,11 @@ class Sheet:
         self._mesh: wp.Mesh | None = None
 
     def locate(self, vertices: np.ndarray, points: np.ndarray) -> Located:
-        """Where points are relative to the sheet.
+        """Positions of points relative to the sheet.
 
         Args:
-            vertices: The sheet's vertices [m], shape [V, 3].
-            points: Shape [N, 3].
+            vertices: Vertices of the sheet [m], shape [V, 3].
+            points: Points [m], shape [N, 3].
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         sign = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
@@ -98,15 +99,24 @@ class Sheet:
         return Located(distance, np.asarray(face), closest, normal, weights, ~border)
 
     def crossings(self, vertices: np.ndarray, other: Sheet, other_vertices: np.ndarray) -> np.ndarray:
-        """How many faces of another sheet each face crosses, int [F]. Touching counts."""
+        """Number of faces of another sheet that each face crosses, int [F]; faces that touch count.
+
+        Args:
+            vertices: Vertices of this sheet [m], shape [V, 3].
+            other: The other sheet.
+            other_vertices: Vertices of the other sheet [m], shape [W, 3].
+        """
         return other._crossed_by(other_vertices, self._triangles, vertices, same=False)
 
     def self_crossings(self, vertices: np.ndarray) -> np.ndarray:
-        """How many later faces that share no vertex with it each face crosses, int [F]."""
+        """Number of later faces without a common vertex that each face crosses, int [F]; vertices [m] are [V, 3]."""
         return self._crossed_by(vertices, self._triangles, vertices, same=True)
 
     def gap_to(self, vertices: np.ndarray, other: Sheet, other_vertices: np.ndarray) -> float:
-        """Least distance to another sheet that it does not cross [m]: vertex to face, both ways, or edge to edge."""
+        """Least distance to another sheet that this one does not cross [m]: vertex to face, both ways, or edge to edge.
+
+        Arguments are those of :meth:`crossings`.
+        """
         a, b = (np.ascontiguousarray(v, dtype=np.float64) for v in (vertices, other_vertices))
         gap = min(
             np.sqrt(igl.point_mesh_squared_distance(a, b, other.faces)[0].min()),
@@ -134,7 +144,7 @@ class Sheet:
 
 
 def _segment_distance(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Distance between segments [N, 2, 3] whose closest points both lie inside; infinity for others, [N]."""
+    """Distances between pairs of segments [N, 2, 3] whose closest points both lie inside; otherwise infinity, [N]."""
     u, v, w = p[:, 1] - p[:, 0], q[:, 1] - q[:, 0], p[:, 0] - q[:, 0]
     uu, uv, vv, uw, vw = (np.einsum("nc,nc->n", x, y) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     area = np.maximum(uu * vv - uv * uv, 1e-30)
@@ -145,15 +155,15 @@ def _segment_distance(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 class Located:
-    """Points relative to a sheet, arrays of one entry a point.
+    """Positions of points relative to a sheet, as arrays with one entry per point.
 
     Attributes:
-        distance: Negative behind the sheet [m], shape [N].
+        distance: Signed distance, negative behind the sheet [m], shape [N].
         face: Nearest face, shape [N].
         closest: Closest point of the sheet [m], shape [N, 3].
-        normal: Angle-weighted normal there, shape [N, 3].
+        normal: Angle-weighted normal at the closest point, shape [N, 3].
         weights: Barycentric coordinates of the closest point, shape [N, 3].
-        interior: Whether the closest point is off the border, so that the sign means something, bool [N].
+        interior: Whether the closest point is off the border, so that the sign is defined, bool [N].
     """
 
     def __init__(
@@ -181,8 +191,8 @@ class LayerFigures:
     """Figures of an outfit, frame by frame.
 
     Args:
-        garments: Innermost first.
-        reach: How far a vertex counts as gone through [m].
+        garments: Garments, innermost first.
+        reach: Largest distance at which a vertex counts as gone through [m].
     """
 
     def __init__(self, garments: Sequence[Garment], reach: float = REACH):
@@ -193,17 +203,18 @@ class LayerFigures:
         """Figures of one frame.
 
         Args:
-            vertices: Of each garment [m], shape [V, 3].
+            vertices: Vertices of each garment [m], shape [V, 3].
 
         Returns:
-            `layer_inside`: share of the vertices of all outer garments behind any inner one; `layer_inside_K`: of
-            garment K alone, K = 1 being the second. `layer_crossings`: pairs of triangles of different garments that
-            cross. `layer_depth`: how far the deepest vertex has gone through [m], an outer one behind an inner garment
-            or, next to a crossing, an inner one in front of an outer garment; of garments that cross, as others
-            are behind each other only by way of a border. One garment: no figures.
+            `layer_inside`: share of the vertices of all outer garments that are behind any inner one; `layer_inside_K`:
+            this share for garment K alone, K = 1 being the second. `layer_crossings`: number of pairs of triangles of
+            different garments that cross. `layer_depth`: largest distance by which a vertex has gone through [m], an
+            outer vertex behind an inner garment or, next to a crossing, an inner vertex in front of an outer garment;
+            only garments that cross count, as others are behind each other only around a border. A single garment has
+            no figures.
 
         Raises:
-            ValueError: Not one array a garment.
+            ValueError: The number of arrays is not that of the garments.
         """
         if len(vertices) != len(self._sheets):
             raise ValueError(f"{len(self._sheets)} garments have been announced, {len(vertices)} are given")
@@ -224,7 +235,7 @@ class LayerFigures:
                 if crossed.any():
                     crossings += int(crossed.sum())
                     depth = max(depth, -located.distance[behind].min(initial=0.0))
-                    poking = np.unique(inner.faces[crossed > 0])  # elsewhere, sleeves hang in front of other layers
+                    poking = np.unique(inner.faces[crossed > 0])  # away from crossings, sleeves hang in front of layers
                     located = outer.locate(vertices[k], vertices[n][poking])
                     depth = max(depth, located.distance[located.beyond(self._reach)].max(initial=0.0))
             figures[f"layer_inside_{k}"] = float(inside.mean())

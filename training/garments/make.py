@@ -1,8 +1,8 @@
 """Parametric garments, cut from a surface around the body in its rest pose.
 
-A garment is the part of that surface (`garment_shell`) where a signed field is positive (`garment_regions`): below the
-neckline, above the hem, up to a point along the sleeve. Skirts and hems continue from the lower boundary as tubes
-(`garment_tubes`), jackets are opened in front, and the whole is remeshed isotropically and kept clear of the body.
+A garment is the part of that surface (`shell`) where a signed field is positive (`regions`): below the neckline, above
+the hem, up to a point along the sleeve. Skirts and hems continue from the lower boundary as tubes (`tubes`), jackets
+are opened in front, and the whole is remeshed isotropically and kept clear of the body.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from .regions import bottom, covered, ease_field, keep_field
 from .shell import shell
 from .tubes import with_tube
 
-_BAND = 0.03  # height of what is pinned [m]
-_FLOOR = 0.06  # skirts end at least this much above the floor [m]
+_BAND = 0.03  # height of the band that is pinned [m]
+_FLOOR = 0.06  # least height of a skirt's end above the floor [m]
 
 
 def make_garment(body: RestBody, pattern: Pattern, gap: float = 0.011) -> tuple[Garment, float]:
@@ -40,10 +40,11 @@ def make_garment(body: RestBody, pattern: Pattern, gap: float = 0.011) -> tuple[
         gap: Least distance from the body at the start [m].
 
     Returns:
-        The garment, pinned where it would fall off otherwise, and the edge length aimed at [m].
+        The garment, pinned where it would fall off otherwise, and the intended edge length [m].
 
     Raises:
-        ValueError: Unknown category or neckline, or a pattern that cannot be cut cleanly for this body; it says why.
+        ValueError: The category or neckline is unknown, or the pattern cannot be cut cleanly for this body; the message
+            names the reason.
     """
     for what, known in (("category", CATEGORIES), ("neckline", NECKLINES)):
         if getattr(pattern, what) not in known:
@@ -55,13 +56,13 @@ def make_garment(body: RestBody, pattern: Pattern, gap: float = 0.011) -> tuple[
     vertices = pushed_out(vertices, faces, body.vertices, body.faces, gap)
     name = pattern.category
     garment = Garment(vertices.astype(np.float32), faces.astype(np.int32), pins=_pins(vertices, pattern), name=name)
-    if found := faults(garment, body, pattern, gap):
-        raise ValueError(f"{name} does not suit this body: {'; '.join(found)}. Draw another pattern.")
+    if errors := faults(garment, body, pattern, gap):
+        raise ValueError(f"{name} does not suit this body: {'; '.join(errors)}. Draw another pattern.")
     return garment, edge
 
 
 def _surface(body: RestBody, pattern: Pattern) -> tuple[np.ndarray, np.ndarray]:
-    """The garment as a fine triangle mesh of no particular quality."""
+    """Vertices [m] and faces of the garment as a fine triangle mesh, before remeshing."""
     arms = body.weight_of("LeftArm", "RightArm")
     around = shell(body, ease_field(body, pattern), covered(body, pattern))
     keep = without_specks(around.faces, keep_field(body, pattern, around), least=12)
@@ -81,7 +82,7 @@ def _surface(body: RestBody, pattern: Pattern) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _opened(vertices: np.ndarray, faces: np.ndarray, body: RestBody, pattern: Pattern) -> tuple[np.ndarray, np.ndarray]:
-    """Takes a strip out of the front, from hem to neck. The strip may be narrower than the faces."""
+    """Removes a strip of the front from hem to neck; the strip may be narrower than the faces."""
     half = 0.5 * pattern.opening
     for edge in (-half, half):
         vertices, faces, _ = split_at_zero(vertices, faces, vertices[:, 0] - edge)
@@ -91,7 +92,7 @@ def _opened(vertices: np.ndarray, faces: np.ndarray, body: RestBody, pattern: Pa
 
 
 def _pins(vertices: np.ndarray, pattern: Pattern) -> np.ndarray | None:
-    """The upper end of what nothing else holds up: waistband, straps, strapless edge, the crown of a hood."""
+    """Vertices at the upper end of a garment that would fall off: waistband, straps, strapless edge, hood's crown."""
     strapped = pattern.category in WITH_BODICE and pattern.neckline in PINNED_NECKLINES
     if not strapped and pattern.category not in ("trousers", "skirt", "hooded_jacket"):
         return None

@@ -1,9 +1,9 @@
 """Outfits of two and three garments, disjoint at the start.
 
-D-LAYERS (Towards Multi-Layered 3D Garments Animation, supplement B) dresses jumpsuits, dresses, T-shirts with trousers
-or skirts, and jackets with and without hoods over them. Each garment is cut for itself; then those further out are
-moved off those below them, by heights along their normals that are smooth over the sheet. Where an inner garment ends,
-the outer one follows the body.
+D-LAYERS (Towards Multi-Layered 3D Garments Animation, supplement B) has jumpsuits, dresses, T-shirts with trousers or
+skirts, and jackets with and without hoods over them. Each garment is cut by itself; then outer garments are moved off
+those below them, by heights along their normals that are smooth over the sheet. Where an inner garment ends, the outer
+one follows the body.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ THREE = (
 )
 OUTER = ("jacket", "hooded_jacket", "dress")
 INNER_GAP, MIDDLE_GAP, OUTER_GAP = 0.006, 0.011, 0.022
-_REACH = 0.2  # how far an outer garment may have been cut behind an inner one [m]
-_POKE = 0.03  # how far an inner garment may poke through a face of an outer one [m]
+_REACH = 0.2  # largest distance at which an outer garment may have been cut behind an inner one [m]
+_POKE = 0.03  # largest distance by which an inner garment may poke through a face of an outer one [m]
 _ROUNDS, _STEP, _DIRECTION_SMOOTHING = 24, 0.02, 10
-_STRETCHED = 1.3  # an edge that grows by more has the garment remeshed
-_ENOUGH = 0.75  # of the distance between garments, measured everywhere; it is asked for at a few points of each face
-_FADE = 0.97  # per smoothing step, so that the field decays within some ten edges of what it clears
+_STRETCHED = 1.3  # if an edge grows by a larger factor, the garment is remeshed
+_ENOUGH = 0.75  # share of the distance between garments that must hold everywhere; all of it holds at a few points
+_FADE = 0.97  # factor per smoothing step, so that the field decays within some ten edges of the part it clears
 
 
 class OutfitError(ValueError):
@@ -60,11 +60,11 @@ class OutfitError(ValueError):
 
 @dataclass(frozen=True)
 class OutfitPattern:
-    """Garments worn over each other. Which of a T-shirt and trousers lies over the other is their order.
+    """Garments worn over each other. Their order decides, for instance, whether a T-shirt lies over the trousers.
 
     Attributes:
-        layers: Innermost first.
-        gaps: Least distance of each from the body [m].
+        layers: Patterns of the garments, innermost first.
+        gaps: Least distance of each garment from the body [m].
         between: Least distance between garments where they lie over each other [m].
     """
 
@@ -84,15 +84,15 @@ class OutfitPattern:
 
 @dataclass(frozen=True)
 class LayerReport:
-    """How garments lie over each other.
+    """Collisions between the garments of an outfit.
 
     Attributes:
-        intersections: Pairs of triangles of different garments that cross.
-        smallest_gap: Least distance between two garments [m]; 0 where they cross, infinite for one garment.
-        inside: Largest share of an outer garment's vertices behind an inner one.
-        self_intersections: Pairs of triangles of the same garment that cross and share no vertex.
-        crossing: Pairs of triangles for each pair of garments that cross, by their numbers, inner one first; the same
-            number twice where a garment crosses itself.
+        intersections: Number of pairs of triangles of different garments that cross.
+        smallest_gap: Least distance between two garments [m]; 0 if they cross, infinite for a single garment.
+        inside: Largest share of an outer garment's vertices that are behind an inner one.
+        self_intersections: Number of pairs of triangles of one garment that cross and share no vertex.
+        crossing: Number of pairs of triangles that cross for each pair of garments, given by their numbers, inner one
+            first; a garment that crosses itself has its number twice.
     """
 
     intersections: int
@@ -106,12 +106,12 @@ def sampled_outfit(rng: np.random.Generator, faces: int, count: int | None = Non
     """An outfit drawn at random.
 
     Args:
-        rng: Where randomness comes from.
-        faces: Faces of a T-shirt; other garments scale with their area.
-        count: Garments, 2 or 3; None draws it, too.
+        rng: Random number generator.
+        faces: Number of faces of a T-shirt; that of other garments scales with their area.
+        count: Number of garments, 2 or 3; None draws it, too.
 
     Raises:
-        ValueError: Another number of garments.
+        ValueError: The number of garments is another.
     """
     if count not in (None, 2, 3):
         raise ValueError(f"outfits have 2 or 3 garments, not {count}")
@@ -122,7 +122,13 @@ def sampled_outfit(rng: np.random.Generator, faces: int, count: int | None = Non
 
 
 def outfit_of(categories: Sequence[str], rng: np.random.Generator, faces: int) -> OutfitPattern:
-    """An outfit of given categories, innermost first, its measures drawn at random."""
+    """An outfit with measures drawn at random.
+
+    Args:
+        categories: Categories of the garments, innermost first.
+        rng: Random number generator.
+        faces: Number of faces of a T-shirt; that of other garments scales with their area.
+    """
     layers, gaps = [], []
     for order, category in enumerate(categories):
         pattern = sampled_pattern(category, rng, faces)
@@ -141,13 +147,13 @@ def make_outfit(body: RestBody, outfit: OutfitPattern) -> tuple[tuple[Garment, f
 
     Args:
         body: The body in its rest pose.
-        outfit: What to make.
+        outfit: Patterns and distances of the garments.
 
     Returns:
-        Per garment, innermost first: the garment, and the edge length aimed at [m].
+        Each garment and its intended edge length [m], innermost first.
 
     Raises:
-        OutfitError: Garments still cross; it says which and how often.
+        OutfitError: Garments still cross; the message names them and the number of crossings.
     """
     made: list[tuple[Garment, float]] = []
     for pattern, gap in zip(outfit.layers, outfit.gaps, strict=True):
@@ -165,7 +171,7 @@ def make_outfit(body: RestBody, outfit: OutfitPattern) -> tuple[tuple[Garment, f
 
 
 def layers_disjoint(garments: Sequence[Garment]) -> LayerReport:
-    """Measures how the garments of an outfit, innermost first, lie over each other at rest. Crossings are exact."""
+    """Measures collisions between the garments of an outfit, innermost first, at rest; crossings are exact."""
     sheets = [Sheet(garment.faces) for garment in garments]
     points = [garment.vertices for garment in garments]
     crossing, gap, inside = {}, np.inf, 0.0
@@ -185,7 +191,7 @@ def layers_disjoint(garments: Sequence[Garment]) -> LayerReport:
 def _over(
     garment: Garment, edge: float, below: Sequence[Garment], body: RestBody, gap: float, between: float
 ) -> tuple[Garment, float]:
-    """The garment moved off those below it, and remeshed where that stretched it; and the edge length aimed at."""
+    """The garment moved off those below it, and remeshed if that stretched it; and the intended edge length [m]."""
     inner = [_Below(g) for g in below]
     done = _moved(garment, _cleared(garment.vertices.astype(np.float64), garment.faces, inner, body, gap, between))
     before, after = (np.linalg.norm(np.diff(g.vertices[garment.edges], axis=1), axis=2) for g in (garment, done))
@@ -205,7 +211,7 @@ def _moved(garment: Garment, vertices: np.ndarray) -> Garment:
 
 
 def _carried_pins(garment: Garment, points: np.ndarray) -> np.ndarray:
-    """Which points on a garment's surface are nearest to one of its pins, of the vertices of the face they lie on."""
+    """Points on a garment's surface, as indices, that of the vertices of their face are nearest to a pin."""
     pinned = np.zeros(len(garment.vertices), bool)
     pinned[garment.pins] = True
     vertices, faces = garment.vertices.astype(np.float64), garment.faces.astype(np.int64)
@@ -215,7 +221,7 @@ def _carried_pins(garment: Garment, points: np.ndarray) -> np.ndarray:
 
 
 class _Below:
-    """An inner garment and points all over it: vertices, middles of edges and of faces, with normals."""
+    """An inner garment and points all over it: vertices, and middles of edges and faces, with normals."""
 
     def __init__(self, garment: Garment):
         self.sheet = Sheet(garment.faces)
@@ -233,8 +239,8 @@ def _cleared(
 ) -> np.ndarray:
     """Vertices moved to at least `gap` from the body and `between` in front of the garments below.
 
-    They move along smoothed normals of the sheet as it was cut, each by a height of its own. Heights are smoothed and
-    fade between rounds in which those that are too small are raised.
+    They move along smoothed normals of the original sheet, each by a height of its own. Heights that are too small are
+    raised in rounds, between which all heights are smoothed and reduced.
     """
     sheet, mean = Sheet(faces), averaging(faces, len(vertices))
     direction = _vertex_normals(vertices, faces)
@@ -257,7 +263,7 @@ def _cleared(
 
 
 def _off_body(points: np.ndarray, direction: np.ndarray, body: RestBody, gap: float) -> np.ndarray:
-    """How far vertices must rise to be clear of the body [m]."""
+    """Height by which vertices must rise to be clear of the body [m]."""
     distance, _, closest, normal = igl.signed_distance(
         points, body.vertices, body.faces.astype(np.int64), sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     )
@@ -265,7 +271,7 @@ def _off_body(points: np.ndarray, direction: np.ndarray, body: RestBody, gap: fl
 
 
 def _off_inner(points: np.ndarray, direction: np.ndarray, inner: _Below, between: float) -> np.ndarray:
-    """How far vertices that are behind an inner garment, or too close to it, must rise [m]."""
+    """Height by which vertices that are behind an inner garment, or too close to it, must rise [m]."""
     at = inner.sheet.locate(inner.vertices, points)
     wanted = at.interior & (np.abs(at.distance) < _REACH) & ((at.normal * direction).sum(1) > 0.2)
     rise = np.maximum(between - at.distance, 0.0)
@@ -273,7 +279,7 @@ def _off_inner(points: np.ndarray, direction: np.ndarray, inner: _Below, between
 
 
 def _off_points(points: np.ndarray, direction: np.ndarray, sheet: Sheet, inner: _Below, between: float) -> np.ndarray:
-    """How far the corners of faces that points of an inner garment poke through or come too close to must rise [m]."""
+    """Height [m] by which the corners of a face must rise if an inner garment pokes through it or is too close."""
     at = sheet.locate(points, inner.points)
     wanted = at.interior & (np.abs(at.distance) < _POKE) & ((at.normal * inner.normals).sum(1) > 0.5)
     short = np.where(wanted, np.maximum(between + at.distance, 0.0), 0.0)
@@ -286,7 +292,7 @@ def _off_points(points: np.ndarray, direction: np.ndarray, sheet: Sheet, inner: 
 def _steepness(
     distance: np.ndarray, points: np.ndarray, closest: np.ndarray, normal: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
-    """Growth of the signed distance along a direction, at least a third."""
+    """Rate of growth of the signed distance along a direction, at least a third."""
     away = np.where(np.abs(distance)[:, None] > 1e-5, (points - closest) * np.sign(distance)[:, None], normal)
     away = away / np.linalg.norm(away, axis=1, keepdims=True)
     return np.maximum((away * direction).sum(1), 1.0 / 3.0)

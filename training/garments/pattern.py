@@ -1,4 +1,4 @@
-"""The parameters of a garment, and which categories have which parts."""
+"""The parameters of a garment, and the parts of each category."""
 
 from __future__ import annotations
 
@@ -22,35 +22,37 @@ _NECKLINES = {
     "jumpsuit": ("round", "v", "straps"),
     "jacket": ("round", "v"),
 }
-# faces relative to a T-shirt, by area
+# number of faces relative to a T-shirt, by area
 _SIZE = {"tshirt": 1.0, "top": 0.8, "trousers": 1.0, "skirt": 1.0, "dress": 1.4, "jumpsuit": 1.5, "jacket": 1.3}
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """What is sampled of a garment. Lengths in metres, shares without unit.
+    """The sampled parameters of a garment.
 
     Attributes:
-        category: One of :data:`CATEGORIES`.
-        sleeve: Where sleeves end: 0 at the shoulder, 1 at the elbow, 2 at the wrist. See :func:`needs_forearms`. There
-            are none with straps or strapless.
-        hem: How far a shirt or jacket reaches below the hips, 2 cm above their joints; negative: it ends above them.
+        category: Category, one of :data:`CATEGORIES`.
+        sleeve: Place where sleeves end: 0 at the shoulder, 1 at the elbow, 2 at the wrist. See :func:`needs_forearms`.
+            Garments with straps and strapless ones have no sleeves.
+        hem: Distance of a shirt's or jacket's hem below the hips, which lie 2 cm above their joints [m]; negative for a
+            hem above the hips.
         leg: Share of the leg that trousers cover.
-        skirt_length: Length of a skirt below the waist seam; one that would reach the floor ends above it.
-        flare: Growth of a skirt's radius over its length, beyond what the body below it takes; of the hem of shirts and
-            jackets, per metre.
-        ease: Distance from the body it is cut with.
-        neck: How far the neckline is lowered in front; of straps and strapless garments, the upper edge.
-        faces: Number of faces aimed at.
-        neckline: One of :data:`NECKLINES`; jackets have the first three only. Straps, and the upper edge of strapless
-            garments, are pins.
-        neck_width: How far the neckline is widened on each side; straps move outwards by half of it.
-        strap: Width of each strap.
-        sleeve_flare: Growth of the sleeves' distance from the arm, from shoulder to elbow.
-        leg_flare: Growth of the trouser legs' distance from the leg, from hip to ankle.
-        waist: How far waistline or waistband lie above their usual place.
-        opening: Width of a jacket's opening in front.
-        hood: Distance between head and hood, beyond the ease. The hood's crown is pinned.
+        skirt_length: Length of a skirt below the waist seam [m]; a skirt that would reach the floor ends above it.
+        flare: Growth of a skirt's radius over its length, in addition to the growth that the body requires [m]; for
+            shirts and jackets, growth at the hem per metre of length.
+        ease: Distance from the body at which the garment is cut [m].
+        neck: Distance by which the neckline is lowered in front [m]; for garments with straps and strapless ones, by
+            which the upper edge is lowered.
+        faces: Approximate number of faces.
+        neckline: Neckline, one of :data:`NECKLINES`; jackets have the first three only. Straps, and the upper edge of
+            strapless garments, are pins.
+        neck_width: Distance by which the neckline is widened on each side [m]; straps move outwards by half of it.
+        strap: Width of each strap [m].
+        sleeve_flare: Growth of the sleeves' distance from the arm, from shoulder to elbow [m].
+        leg_flare: Growth of the trouser legs' distance from the leg, from hip to ankle [m].
+        waist: Height of the waistline or waistband above its usual place [m].
+        opening: Width of a jacket's opening in front [m].
+        hood: Distance between head and hood in addition to the ease [m]. The hood's crown is pinned.
     """
 
     category: str
@@ -72,20 +74,20 @@ class Pattern:
     hood: float = 0.02
 
     def as_dict(self) -> dict[str, float | int | str]:
-        """Plain values for a manifest."""
+        """The attributes by name, for a manifest."""
         return asdict(self)
 
 
 def sampled_pattern(category: str, rng: np.random.Generator, faces: int, long_sleeves: bool = False) -> Pattern:
-    """A pattern with its measures drawn at random.
+    """A pattern with measures drawn at random.
 
     Args:
-        category: One of :data:`CATEGORIES`.
-        rng: Where randomness comes from.
-        faces: Faces of a T-shirt; other categories scale with their area.
-        long_sleeves: Whether sleeves may reach the wrists, and those of jackets do. The body's forearms must then be
-            part of the collider, or the sleeves bunch at the elbows (:func:`needs_forearms`). By default they end
-            above the elbows.
+        category: Category, one of :data:`CATEGORIES`.
+        rng: Random number generator.
+        faces: Number of faces of a T-shirt; that of other categories scales with their area.
+        long_sleeves: Whether sleeves may reach the wrists, as those of jackets then do. The body's forearms must then
+            be part of the collider, otherwise the sleeves bunch at the elbows (:func:`needs_forearms`). If False,
+            sleeves end above the elbows.
     """
     if category not in CATEGORIES:
         raise ValueError(f"unknown garment category {category!r}; there are {', '.join(CATEGORIES)}")

@@ -1,7 +1,7 @@
-"""Where on a body a garment lies: fields over the body's shell that are positive inside the garment, in metres.
+"""The part of a body that a garment covers: fields on the body's shell that are positive inside the garment [m].
 
-Heights (hems, waist) are measured at the garment, necklines and sleeves at the body point below it. Arms are told from
-the torso by skinning weight, not by position.
+Heights (hems, waist) are measured at the garment, necklines and sleeves at the body point below it. Arms are
+distinguished from the torso by skinning weight, not by position.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ def ease_field(body: RestBody, pattern: Pattern) -> np.ndarray:
     if pattern.category in WITH_LEGS:
         top, foot = body.joint("LeftUpLeg")[1], body.joint("LeftFoot")[1]
         ease += pattern.leg_flare * np.clip((top - y) / (top - foot), 0.0, 1.0)
-        # between the legs, only as much as leaves a gap in the middle plane
+        # between the legs the ease is limited, so that a gap remains at the middle plane
         legs = _step(top - y, 0.0, 0.08)
-        room = np.maximum(0.6 * np.abs(x), 0.008)
+        most = np.maximum(0.6 * np.abs(x), 0.008)
         inside = _step(-np.sign(x) * _normals(body)[:, 0], 0.0, 0.4) * legs
-        ease = (1 - inside) * ease + inside * np.minimum(ease, room)
+        ease = (1 - inside) * ease + inside * np.minimum(ease, most)
     if pattern.category in ("trousers", "skirt"):  # the waistband sits close
         tight = _step(y, waist(body, pattern) - 0.12, waist(body, pattern) - 0.02)
         ease = (1 - tight) * ease + tight * np.minimum(ease, _WAIST_EASE)
@@ -48,7 +48,7 @@ def ease_field(body: RestBody, pattern: Pattern) -> np.ndarray:
 
 
 def bottom(body: RestBody, pattern: Pattern) -> float:
-    """Height of the lower end of what is cut from the body's surface [m]; tubes continue from there."""
+    """Height of the lower end of the part that is cut from the body's surface [m]; tubes continue from there."""
     hip = body.joint("LeftUpLeg")[1]
     if pattern.category in WITH_LEGS:
         return float(hip - pattern.leg * (hip - body.joint("LeftFoot")[1]))
@@ -58,7 +58,7 @@ def bottom(body: RestBody, pattern: Pattern) -> float:
 
 
 def covered(body: RestBody, pattern: Pattern) -> np.ndarray:
-    """Body vertices that the garment can lie over, bool [U]; a part that it does not lie over does no harm."""
+    """Mask of the body vertices that the garment may cover, bool [U]; too many of them do no harm."""
     y = body.vertices[:, 1]
     end = "Arm" if pattern.category not in WITH_BODICE else "ForeArm" if pattern.sleeve <= 1.1 else "Hand"
     covered = (y > bottom(body, pattern) - 0.02) & (body.weight_of(f"Left{end}", f"Right{end}") < 0.5)
@@ -68,7 +68,7 @@ def covered(body: RestBody, pattern: Pattern) -> np.ndarray:
 
 
 def keep_field(body: RestBody, pattern: Pattern, around: Shell) -> np.ndarray:
-    """Positive where the garment is [m], shape [V] of the shell's vertices."""
+    """Field that is positive inside the garment [m], shape [V] for the vertices of the shell."""
     category, y = pattern.category, around.vertices[:, 1]
     arms = around.carried(body.weight_of("LeftArm", "RightArm"))
     on_arm = arms > 0.25
@@ -83,7 +83,7 @@ def keep_field(body: RestBody, pattern: Pattern, around: Shell) -> np.ndarray:
 
 
 def _sleeves(body: RestBody, pattern: Pattern, around: Shell) -> np.ndarray:
-    """Positive up to the sleeves' ends [m]."""
+    """Field that is positive up to the ends of the sleeves [m]."""
     keep = np.full(len(around.skin), _FAR)
     for side in ("Left", "Right"):
         arm = around.carried(body.weight_of(f"{side}Arm")) > 0.25
@@ -94,9 +94,10 @@ def _sleeves(body: RestBody, pattern: Pattern, around: Shell) -> np.ndarray:
 
 
 def _along_arm(body: RestBody, points: np.ndarray, side: str, longest: float) -> np.ndarray:
-    """Where along an arm points are: 0 at the shoulder, 1 at the elbow, 2 at the wrist; shape [N].
+    """Places of points along an arm: 0 at the shoulder, 1 at the elbow, 2 at the wrist; shape [N].
 
-    Up to `longest` 1 the upper arm's axis alone decides; in the bend of the elbow, the two axes disagree.
+    If `longest` is at most 1, the upper arm's axis alone decides, since in the bend of the elbow the axes of upper arm
+    and forearm disagree.
     """
     shoulder, elbow, wrist = (body.joint(side + name) for name in ("Arm", "ForeArm", "Hand"))
     upper, lower = elbow - shoulder, wrist - elbow
@@ -110,7 +111,7 @@ def _along_arm(body: RestBody, points: np.ndarray, side: str, longest: float) ->
 
 
 def _neckline(body: RestBody, pattern: Pattern, around: Shell) -> np.ndarray:
-    """Positive below the neckline [m]."""
+    """Field that is positive below the neckline [m]."""
     x, y, z = around.skin.T
     head = around.carried(body.weight_of("Neck"))
     neck, shoulder = body.joint("Neck"), body.joint("LeftArm")
@@ -134,12 +135,12 @@ def _neckline(body: RestBody, pattern: Pattern, around: Shell) -> np.ndarray:
 
 
 def _face_opening(body: RestBody, around: Shell) -> np.ndarray:
-    """Positive on all of torso, neck and head but the face [m]."""
+    """Field that is positive on torso, neck and head except the face [m]."""
     head = body.vertices[body.weight_of("Head") > 0.7]
     chin, top = head[:, 1].min(), head[:, 1].max()
     _, y, z = around.skin.T
     rim = head[:, 2].min() + 0.62 * np.ptp(head[:, 2])  # in front of the ears
-    crown = 0.25 * (y - 0.5 * (chin + top))  # the hood reaches further over the forehead
+    crown = 0.25 * (y - 0.5 * (chin + top))  # the hood extends further over the forehead
     on_face = 0.3 * (around.carried(body.weight_of("Head")) - 0.3)
     return np.maximum(rim + crown - z, -on_face)
 

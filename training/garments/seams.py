@@ -1,8 +1,8 @@
 """Random seam cuts: slits from a boundary inwards and seams opened in the middle of a garment.
 
 *Neural Garment Dynamics via Manifold-Aware Transformers* (Li et al. 2024, figure 9) cuts one dress in twelve ways, ten
-to train on and two to test, to show that geodesic attention follows connectivity it has not seen. A cut is described by
-angles and heights around the garment, so it applies to any mesh: it runs along the edges nearest to that line.
+for training and two for tests, to show that geodesic attention follows unseen connectivity. A cut is described by a
+line in angles and heights around the garment, so it applies to any mesh: it runs along the edges nearest to that line.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from scipy.sparse.csgraph import dijkstra
 
 from warpgarment.objects.garment import Garment
 
-_SAMPLES = 48  # points along an ideal line
-_APART = np.radians(30.0)  # between cuts
-_STRAIGHTNESS = 2.0  # how much dearer an edge gets per edge length of distance from the line
+_SAMPLES = 48  # number of points along an ideal line
+_APART = np.radians(30.0)  # least angle between cuts [rad]
+_STRAIGHTNESS = 2.0  # growth of an edge's cost per edge length of distance from the line
 
-# where cuts run, as angles about the vertical axis [degrees]: 0 is the front, 90 the left side, 180 the back
+# places of cuts, as angles about the vertical axis [degrees]: 0 is the front, 90 the left side, 180 the back
 _SIDES = ((60.0, 120.0), (240.0, 300.0))
 _ALL_AROUND = ((0.0, 360.0),)
 _ANGLES = {
@@ -38,9 +38,10 @@ class Seam:
     """One cut: the part of a garment's surface along a straight line in angle and height.
 
     Attributes:
-        angle: Where the lower end is, about the vertical axis [rad]; 0 is the front (+Z), pi/2 the left side (+X).
-        low: Height of the lower end as a share of the garment's height; 0 or less: on the boundary there, a slit.
-        high: Height of the upper end.
+        angle: Angle of the lower end about the vertical axis [rad]; 0 is the front (+Z), pi/2 the left side (+X).
+        low: Height of the lower end as a share of the garment's height; at 0 or less the cut starts at the boundary and
+            is a slit.
+        high: Height of the upper end as a share of the garment's height.
         turn: Angle from the lower to the upper end [rad].
     """
 
@@ -52,10 +53,10 @@ class Seam:
 
 @dataclass(frozen=True)
 class Seams:
-    """Cuts of one garment, in the order they are made.
+    """Cuts of one garment.
 
     Attributes:
-        cuts: Any number.
+        cuts: Cuts in the order in which they are made; any number.
     """
 
     cuts: tuple[Seam, ...]
@@ -64,17 +65,17 @@ class Seams:
         return bool(self.cuts)
 
     def as_dict(self) -> dict:
-        """Plain values for a manifest."""
+        """The cuts as plain values, for a manifest."""
         return asdict(self)
 
 
 def sampled_seams(rng: np.random.Generator, category: str, count: int | None = None) -> Seams:
-    """Cuts drawn at random: two thirds slits from the hem, upright or slanted, the others seams opened in the middle.
+    """Cuts drawn at random: two thirds are slits from the hem, upright or slanted, the others seams within the garment.
 
     Args:
-        rng: Where randomness comes from.
-        category: Of the garment; where it is cut differs between them.
-        count: How many; None draws 1 to 3. There are fewer where no room is left between those drawn before.
+        rng: Random number generator.
+        category: Category of the garment, which decides on the places of cuts.
+        count: Number of cuts; None draws 1 to 3. There are fewer if no space is left between earlier cuts.
     """
     count = int(rng.integers(1, 4)) if count is None else count
     cuts: list[Seam] = []
@@ -101,23 +102,23 @@ def _sampled_cut(rng: np.random.Generator, category: str) -> Seam:
 
 
 def _angle_between(a: Seam, b: Seam) -> float:
-    """Least angle between the parts of the circle that two cuts lie in [rad]; 0 where they overlap."""
+    """Least angle between the parts of the circle that two cuts cover [rad]; 0 if they overlap."""
     middles = a.angle + 0.5 * a.turn - b.angle - 0.5 * b.turn
     return max(abs(float(np.angle(np.exp(1j * middles)))) - 0.5 * (abs(a.turn) + abs(b.turn)), 0.0)
 
 
 def cut_seams(garment: Garment, seams: Seams) -> Garment:
-    """Cuts a garment along mesh edges. Its rest shape stays as it is; vertices along a cut become two at one place.
+    """Cuts a garment along mesh edges. Its rest shape does not change; each vertex along a cut is doubled in place.
 
-    The copies of a vertex are separate as far as the topology goes, so cloth can part there. Both copies of a pinned
-    vertex are pins. :func:`parted` moves them off each other for the start of a simulation.
+    The copies of a vertex are not connected, so the cloth can part there. Both copies of a pinned vertex are pins.
+    :func:`parted` moves the copies off each other for the start of a simulation.
 
     Args:
-        garment: Standing upright, in one piece or more.
-        seams: Where to cut.
+        garment: Upright garment of one or more pieces.
+        seams: Cuts to make.
 
     Returns:
-        The garment, in as many pieces as before. Every cut has two edges at least, so that it opens.
+        The garment, with its number of pieces unchanged. Every cut has at least two edges, so that it opens.
 
     Raises:
         ValueError: A cut lies where the garment has no surface.
@@ -144,12 +145,12 @@ def parted(garment: Garment, vertices: np.ndarray, distance: float) -> np.ndarra
     """Moves the two sides of cuts apart, which self-contact needs at the start of a simulation.
 
     Args:
-        garment: With vertices at the same place in its rest shape, as :func:`cut_seams` leaves them.
-        vertices: Where it starts [m], shape [V, 3].
-        distance: Between the sides [m].
+        garment: Garment with vertices at the same place in its rest shape, as :func:`cut_seams` returns it.
+        vertices: Start positions [m], shape [V, 3].
+        distance: Distance between the sides of a cut [m].
 
     Returns:
-        Float32 [V, 3]; pins and everything off the cuts stay where they are.
+        Positions [m], float32 [V, 3]; pins and vertices away from the cuts are not moved.
     """
     _, place, uses = np.unique(garment.vertices, axis=0, return_inverse=True, return_counts=True)
     double = uses[place.ravel()] > 1
@@ -164,7 +165,7 @@ def parted(garment: Garment, vertices: np.ndarray, distance: float) -> np.ndarra
 
 
 def _path(vertices: np.ndarray, faces: np.ndarray, cut: Seam) -> list[int]:
-    """Vertices of the mesh path nearest to a cut's line, inside the sheet but for the start of a slit."""
+    """Vertices of the mesh path nearest to a cut's line; except for the start of a slit they are inside the sheet."""
     line = _line(vertices, faces, cut)
     if len(line) < 2:
         return []
@@ -173,7 +174,7 @@ def _path(vertices: np.ndarray, faces: np.ndarray, cut: Seam) -> list[int]:
     edges = igl.edges(faces)
     near_border = border.copy()
     near_border[edges[border[edges].any(1)]] = True
-    inside = np.flatnonzero(~near_border)  # a cut that ends beside another boundary would leave the garment on a thread
+    inside = np.flatnonzero(~near_border)  # a cut must not end beside another boundary, with only an edge between them
     if not len(inside):
         return []
     if cut.low <= 0:
@@ -197,7 +198,7 @@ def _path(vertices: np.ndarray, faces: np.ndarray, cut: Seam) -> list[int]:
             return []
         path.append(int(before[path[-1]]))
     path.reverse()
-    while len(path) < 3:  # coarser than the cut is long
+    while len(path) < 3:  # the edges are longer than the cut
         beside = edges[(edges == path[-1]).any(1)].sum(1) - path[-1]
         beside = beside[~np.isin(beside, path)]
         if not len(beside):
@@ -207,7 +208,7 @@ def _path(vertices: np.ndarray, faces: np.ndarray, cut: Seam) -> list[int]:
 
 
 def _line(vertices: np.ndarray, faces: np.ndarray, cut: Seam) -> np.ndarray:
-    """Points of the surface along a cut, shape [N, 3]; fewer where rays from the axis do not meet an outside."""
+    """Points of the surface along a cut [m], shape [N, 3]; rays from the axis that meet no outside give no point."""
     low, high = vertices[:, 1].min(), vertices[:, 1].max()
     axis = 0.5 * (vertices.min(0) + vertices.max(0))
     a = vertices[faces[:, 0]]
@@ -229,5 +230,5 @@ def _line(vertices: np.ndarray, faces: np.ndarray, cut: Seam) -> np.ndarray:
             s = (e2 * q).sum(1) / determinant
         met = (u >= 0) & (v >= 0) & (u + v <= 1) & (s > 0) & (normal @ direction > 0)
         if met.any():
-            points.append(eye + s[met].min() * direction)  # the nearest outside: the torso, not a sleeve beyond it
+            points.append(eye + s[met].min() * direction)  # the nearest outside is the torso, not a sleeve beyond it
     return np.array(points)

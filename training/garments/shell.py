@@ -1,7 +1,7 @@
-"""The surface at a given distance from a body, which garments are cut from.
+"""The surface at a given distance from a body, from which garments are cut.
 
 Moving the body's vertices along their normals folds the surface over where limbs meet. The level set of the signed
-distance, `d(x) = ease(nearest body point)`, has no such folds: armpits and crotch fill up as those of loose clothes do.
+distance, `d(x) = ease(nearest body point)`, has no such folds: armpits and crotch are filled as in loose clothes.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class Shell:
 
     Attributes:
         vertices: Positions [m], shape [V, 3].
-        faces: Counter-clockwise seen from outside, shape [F, 3].
-        skin: Nearest point of the body [m], shape [V, 3].
-        corners: Vertices of the body face it lies on, shape [V, 3].
-        weights: Its barycentric coordinates there, shape [V, 3].
+        faces: Vertex indices, counter-clockwise seen from outside, shape [F, 3].
+        skin: Nearest point of the body to each vertex [m], shape [V, 3].
+        corners: Body vertices of the face that holds this point, shape [V, 3].
+        weights: Barycentric coordinates of this point in the face, shape [V, 3].
     """
 
     vertices: np.ndarray
@@ -37,7 +37,7 @@ class Shell:
     weights: np.ndarray
 
     def carried(self, values: np.ndarray) -> np.ndarray:
-        """Values per body vertex [U, ...], interpolated at :attr:`skin`."""
+        """Values at body vertices, [U, ...], interpolated at :attr:`skin`, [V, ...]."""
         return np.einsum("vk,vk...->v...", self.weights, values[self.corners])
 
 
@@ -46,8 +46,8 @@ def shell(body: RestBody, ease: np.ndarray, wanted: np.ndarray) -> Shell:
 
     Args:
         body: The body in its rest pose.
-        ease: Distance per body vertex [m], shape [U].
-        wanted: The body vertices it has to surround, bool [U]; elsewhere it may be missing or open.
+        ease: Distance of the surface at each body vertex [m], shape [U].
+        wanted: Mask of the body vertices that the surface must surround, bool [U]; elsewhere it may be missing or open.
     """
     margin = ease.max() + 4 * SPACING
     low = body.vertices[wanted].min(0) - margin
@@ -58,7 +58,7 @@ def shell(body: RestBody, ease: np.ndarray, wanted: np.ndarray) -> Shell:
     distance, *nearest = _nearest(body, grid)
     level = distance - np.einsum("vk,vk->v", nearest[2], ease[nearest[1]])
     level = gaussian_filter(level.reshape(sizes[::-1]), 0.8, mode="nearest").ravel()
-    level[np.abs(level) < 1e-6] = 1e-6  # no faces without area
+    level[np.abs(level) < 1e-6] = 1e-6  # avoids faces without area
     vertices, faces, *_ = igl.marching_cubes(level, grid, *map(int, sizes), 0.0)
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
     vertices = _smoothed(vertices, faces)
@@ -66,7 +66,10 @@ def shell(body: RestBody, ease: np.ndarray, wanted: np.ndarray) -> Shell:
 
 
 def _nearest(body: RestBody, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Signed distance [N], nearest body point [N, 3], its face's vertices [N, 3] and barycentric coordinates there."""
+    """Signed distance [m], [N]; nearest body point [m], [N, 3]; vertices of its face, [N, 3]; its coordinates, [N, 3].
+
+    The coordinates are barycentric in that face.
+    """
     faces = body.faces.astype(np.int64)
     distance, face, closest, *_ = igl.signed_distance(
         points, body.vertices, faces, sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
@@ -77,7 +80,7 @@ def _nearest(body: RestBody, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _smoothed(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> np.ndarray:
-    """Taubin's smoothing (lambda 0.5, mu -0.53) takes off the steps of the grid without shrinking."""
+    """Taubin's smoothing (lambda 0.5, mu -0.53), which removes the steps of the grid without shrinking."""
     mean = averaging(faces, len(vertices))
     for _ in range(rounds):
         for step in (0.5, -0.53):

@@ -1,4 +1,4 @@
-"""Skirts and hems: tubes that hang from a garment's lowest boundary, around everything of the body that is below."""
+"""Skirts and hems: tubes that hang from a garment's lowest boundary and surround all of the body below it."""
 
 from __future__ import annotations
 
@@ -17,16 +17,19 @@ def with_tube(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Extrudes the lowest boundary loop downwards.
 
-    Each ring is at least as wide as the one above, plus its part of `flare`, and in every direction at least as wide as
+    Each ring is at least as wide as the one above plus its part of `flare`, and in every direction at least as wide as
     the body there plus `ease`.
 
     Args:
-        vertices: Shape [V, 3].
-        faces: Shape [F, 3].
-        body_points: Points of the body that the tube goes around, its arms left out, shape [P, 3].
+        vertices: Positions [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        body_points: Points of the body that the tube surrounds, without the arms [m], shape [P, 3].
         length: Height of the tube [m].
         flare: Growth of the radius over the whole length [m].
         ease: Least distance from the body [m].
+
+    Returns:
+        Vertices [m] and faces of the sheet with the tube.
     """
     loop = min(boundary_loops(faces), key=lambda l: vertices[l, 1].mean())
     base = vertices[loop]
@@ -54,6 +57,6 @@ def with_tube(
         strips.append(np.stack([a[following], b, b[following]], 1))
     tube = np.concatenate(strips)
     directed = {(int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3)}
-    if (int(loop[1]), int(loop[0])) in directed:  # two faces agree where they run along their edge in opposite ways
+    if (int(loop[1]), int(loop[0])) in directed:  # two faces agree if they run along their edge in opposite directions
         tube = tube[:, ::-1]
     return np.concatenate(points), np.concatenate([faces, tube])

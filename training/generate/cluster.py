@@ -1,4 +1,4 @@
-"""The same work on a Ray cluster (extra `cluster`)."""
+"""Work spread over a Ray cluster (extra `cluster`), in place of the processes of `workers`."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from .workers import Done
 def on_cluster(
     function: Callable[[Any], Any], items: list[Any], address: str, *, cpus: float = 1.0, gpus: float = 0.0
 ) -> Iterator[Done]:
-    """Calls `function(item)` for every item as a Ray task; yields in the order they finish.
+    """Calls `function(item)` for every item as a Ray task; yields in the order in which the tasks finish.
 
-    A task whose machine is lost is tried once more by Ray. What the function writes must lie on storage that all
+    Ray tries a task whose machine is lost once more. Files that the function writes must be on storage that all
     machines share.
 
     Args:
-        function: Of one item; sent to the cluster, where warpgarment must be installed.
-        items: What to work on.
-        address: Of the cluster; "local" starts one on this machine and stops it at the end.
-        cpus: Cores that a task occupies.
-        gpus: GPUs, or the share of one.
+        function: Function of one item; it is sent to the cluster, where warpgarment must be installed.
+        items: Arguments of the function, one per task.
+        address: Address of the cluster; "local" starts one on this machine and stops it at the end.
+        cpus: Number of cores that a task occupies.
+        gpus: Number of GPUs that a task occupies, or the share of one.
 
     Raises:
         MissingExtra: Ray is not installed.

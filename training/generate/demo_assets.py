@@ -1,9 +1,9 @@
-"""Makes what the package ships for its demo and tests: a body, its walk, and two garments simulated on it.
+"""Makes the bundled assets for demo and tests: a body, its walk, and two garments simulated on it.
 
     python -m warpgarment.training.generate.demo_assets OUT
 
-Everything comes from this package's own code and Anny; no motion capture is used. OUT/rest_body.npz is the body in its
-rest pose, OUT/body.npz its motion (hands and forearms marked as no collider), OUT/<garment>.npz holds rest_vertices,
+All data come from this package's own code and Anny; no motion capture is used. OUT/rest_body.npz holds the body in its
+rest pose, OUT/body.npz its motion (with hands and forearms marked as no collider), and OUT/<garment>.npz rest_vertices,
 faces, pins and `truth`, the simulated vertices.
 """
 

@@ -1,4 +1,4 @@
-"""A plan carried out up to the simulation: the posed body, and its garments at the start of the motion."""
+"""From a plan to the start of its simulation: the posed body, and its garments at the start of the motion."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from warpgarment.training.teachers import Cloth
 
 from .recipes import BLEND, FPS, GenerateConfig, Plan
 
-ABDUCTION = 15.0  # upper arms are lifted off the torso by this much throughout [degrees]
-GAP = 0.02  # between limbs and torso under one garment [m]
-LAYER_GAP = 0.02  # more for every further one [m]
-PARTED = 0.008  # between the two sides of a cut at the start [m]
+ABDUCTION = 15.0  # angle by which the upper arms are lifted off the torso throughout [degrees]
+GAP = 0.02  # gap between limbs and torso under one garment [m]
+LAYER_GAP = 0.02  # additional gap for each further garment [m]
+PARTED = 0.008  # distance between the two sides of a cut at the start [m]
 
 
 class UnusableMotion(ValueError):
@@ -55,11 +55,11 @@ def body_motion(plan: Plan, config: GenerateConfig) -> tuple[RestBody, np.ndarra
     """The body of a plan and its motion: window of a clip, limbs cleared, torn frames cut, blended in from rest.
 
     Returns:
-        The rest body, bone transforms float32 [T, B, 3, 4] and vertices [m] float32 [T, U, 3], as a sequence stores
-        them: what is simulated is what will be read back.
+        The rest body; bone transforms, float32 [T, B, 3, 4]; vertices [m], float32 [T, U, 3]. They have the values that
+        will be read back from the stored sequence.
 
     Raises:
-        UnusableMotion: Too few frames have room for clothes.
+        UnusableMotion: Too few frames have space for clothes.
     """
     body = rest_body(plan)
     vertices, indices, weights = stored_body(body.vertices, body.bone_indices, body.bone_weights)
@@ -96,9 +96,9 @@ def _poses(plan: Plan, config: GenerateConfig, body: RestBody) -> PoseSequence:
 
 
 def clothed(plan: Plan, body: RestBody, transforms: np.ndarray) -> tuple[tuple[Garment, ...], tuple[Cloth, ...]]:
-    """The garments of a plan as they are at rest, and as the simulation begins, innermost first.
+    """The garments of a plan at rest, and at the start of the simulation, innermost first.
 
-    The rest pose stands at the origin; the motion starts in the same pose elsewhere, a rigid move away.
+    The body at rest stands at the origin; the motion starts in the rest pose at another place, a rigid motion away.
     """
     if len(plan.outfit.layers) == 1:
         made: tuple[tuple[Garment, float], ...] = (make_garment(body, plan.outfit.layers[0], plan.outfit.gaps[0]),)

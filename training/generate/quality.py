@@ -13,15 +13,15 @@ from warpgarment.training.garments.layers import LayerFigures
 
 @dataclass(frozen=True)
 class Limits:
-    """What a good frame may not exceed.
+    """Limits of a good frame.
 
     Attributes:
-        penetration: Deepest vertex inside the collider [m].
+        penetration: Depth of the deepest vertex inside the collider [m].
         stretch: 99th percentile of the relative change of edge lengths.
         largest_stretch: Largest relative change of an edge's length.
-        slip: Largest distance a vertex moves in a frame beyond three times the fastest body vertex [m]; wind may add
-            what it blows in a frame.
-        layer_inside: Largest share of an outer garment's vertices inside an inner one.
+        slip: Largest distance that a vertex moves in a frame, less three times that of the fastest body vertex [m]; the
+            distance that the wind blows in a frame is allowed in addition.
+        layer_inside: Largest share of an outer garment's vertices that are inside an inner one.
     """
 
     penetration: float = 0.010
@@ -33,14 +33,14 @@ class Limits:
 
 @dataclass
 class QualityGate:
-    """Measures frames as they come and says why one is not good.
+    """Measures frames one after another and gives the reason why a frame is not good.
 
     Args:
-        garments: Rest meshes, innermost first; frames hold their vertices end to end.
-        collider_faces: Faces of the body that cloth collides with, shape [G, 3].
-        limits: What is allowed.
-        every: Penetration and layers are measured in every n-th frame.
-        air: What the air moves in a frame at most [m], allowed on top of `slip`.
+        garments: Garments, innermost first; frames hold their vertices end to end.
+        collider_faces: Faces of the body with which cloth collides, shape [G, 3].
+        limits: Limits of a good frame.
+        every: Interval of frames at which penetration and layers are measured.
+        air: Largest distance that the air moves in a frame [m], which is allowed in addition to `slip`.
     """
 
     garments: Sequence[Garment]
@@ -58,12 +58,12 @@ class QualityGate:
         self._frames: list[dict[str, float]] = []
 
     def check(self, frame: int, vertices: np.ndarray, body_vertices: np.ndarray) -> str | None:
-        """Records a frame; returns why it is not good, or None.
+        """Records a frame; returns the reason why it is not good, or None.
 
         Args:
-            frame: Its number.
-            vertices: Garments [m], shape [V, 3].
-            body_vertices: Body [m], shape [U, 3].
+            frame: Number of the frame.
+            vertices: Vertices of the garments [m], shape [V, 3].
+            body_vertices: Vertices of the body [m], shape [U, 3].
         """
         if not np.isfinite(vertices).all():
             return f"frame {frame}: {int((~np.isfinite(vertices)).any(1).sum()):,} vertices are not finite"

@@ -1,7 +1,7 @@
-"""What a data set consists of: recipes, splits, and the plan of every sequence.
+"""The contents of a data set: recipes, and the plan of every sequence.
 
 A plan holds all parameters of one sequence and is a pure function of the set's configuration, the sequence's number and
-the attempt, so any sequence can be made again, on any machine, in any order. Three recipes:
+the attempt, so any sequence can be made again, on any machine, in any order. There are three recipes:
 
 - `cloth3d`: single garments in the manner of CLOTH3D: seven categories, cut and resized, one material. As in
   *Neural Garment Dynamics via Manifold-Aware Transformers* (section 4), skirts are only ever tested on.
@@ -122,7 +122,7 @@ class GenerateConfig:
         return self.recipe == "layers" if self.wind is None else self.wind
 
     def determining(self) -> dict[str, Any]:
-        """The options that the sequences depend on, as plain values; clips by name and size, not by folder."""
+        """The options on which the sequences depend, as plain values; clips appear by name and size, not by folder."""
         values = {k: v for k, v in asdict(self).items() if k in _DETERMINING}
         clips = list_clips(Path(self.motions)) if self.motions else []
         values["clips"] = {p.name: p.stat().st_size for p in clips}
@@ -131,7 +131,7 @@ class GenerateConfig:
         return values | (chosen if single else {"categories": [], "held_out": []})
 
     def command(self) -> str:
-        """What makes the set again; the folder of clips is the user's own."""
+        """The command that makes the set again; the folder of clips is left to the user."""
         words = ["warpgarment generate --out DIR"] + (["--motions CLIPS"] if self.motions else [])
         for option in fields(self):
             value = getattr(self, option.name)
@@ -154,24 +154,24 @@ class ConfigurationError(ValueError):
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that determines a sequence.
+    """All parameters of a sequence.
 
     Attributes:
-        number: Of the sequence.
-        attempt: Counts up when the gate has rejected the one before.
-        recipe: Of the set.
+        number: Number of the sequence.
+        attempt: Number of the attempt, from 0; it grows by one when the gate has rejected the one before.
+        recipe: Recipe of the set.
         split: "train", "validation" or "test".
         motion: Name of a clip, or "procedural:kind".
-        start: Where in the clip the window starts, as a share of what is possible.
+        start: Start of the window in the clip, as a share (0 to 1) of the possible range.
         mirror: Whether left and right are exchanged.
         body: "anny", "bundled", "mannequin" or "creature".
-        phenotype: Anny's shape parameters.
+        phenotype: Anny's shape parameters by name.
         outfit: Measures of the garments, innermost first.
-        materials: One a garment.
-        wind: None: still air.
-        seams: Cuts of the (only) garment; None: none.
-        cut: Number of these cuts; None: none.
-        frames: Frames of motion.
+        materials: Material of each garment.
+        wind: Wind of the sequence; None for still air.
+        seams: Cuts of the only garment; None for no cuts.
+        cut: Number of these cuts in the recipe; None for no cuts.
+        frames: Number of frames of motion.
     """
 
     number: int
@@ -197,7 +197,7 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """The sequence's folder."""
+        """Name of the sequence's folder."""
         return f"{self.number:05d}_{self.category}"
 
 
@@ -250,7 +250,7 @@ def _body(config: GenerateConfig, split: str, order: int, rng: np.random.Generat
 def _outfit(
     config: GenerateConfig, split: str, order: int, rng: np.random.Generator
 ) -> tuple[OutfitPattern, int | None]:
-    """Measures of the garments, and the number of the cuts where the recipe has cuts."""
+    """Measures of the garments, and the number of their cuts, or None if the recipe has no cuts."""
     if config.recipe == "layers":
         return sampled_outfit(rng, config.faces), None
     if config.recipe == "seams":

@@ -5,8 +5,8 @@
     warpgarment generate --out DATA --first 17 --sequences 1 --attempt 0 --keep-rejected    # one attempt again
 
 Sequences that exist are skipped, so an interrupted run continues where it stopped, and a worker that is killed loses
-what it was on. A sequence that the quality gate rejects is drawn anew, up to `attempts` times; the manifest keeps the
-parameters and the reason of every attempt.
+only the sequence it was making. A sequence that the quality gate rejects is drawn anew, up to `attempts` times; the
+manifest keeps the parameters and the reason of every attempt.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ from .recipes import BLEND, FPS, GenerateConfig, Plan, plan_sequence
 
 @dataclass
 class Attempt:
-    """One attempt at a sequence: what it is made from, what came out.
+    """One attempt at a sequence, with its inputs and results.
 
     Attributes:
-        plan: Its parameters.
-        scene: What the teacher simulates; None where the plan could not be carried out.
-        reason: Why it is rejected; None: good so far.
-        arrays: What is stored besides the garments' frames.
-        gate: Measures the frames.
-        frames: Garment vertices of the good frames, float32 [V, 3] each.
-        garments: Rest meshes.
-        began: When work on it started [s].
+        plan: Parameters of the sequence.
+        scene: Scene for the teacher; None if the plan could not be carried out.
+        reason: Reason for the rejection; None as long as the attempt is good.
+        arrays: Arrays to store in addition to the garments' frames.
+        gate: Quality gate that measures the frames.
+        frames: Garment vertices of the good frames [m], float32 [V, 3] each.
+        garments: Garments at rest, innermost first.
+        body_frames: Vertices of the body [m], float32 [T, U, 3].
+        began: Clock at the start of the work [s].
     """
 
     plan: Plan
@@ -58,12 +59,12 @@ class Attempt:
 
 
 def prepare(plan: Plan, config: GenerateConfig) -> Attempt:
-    """Body, motion, garments, scene and gate of a plan; what cannot be made leaves its reason."""
+    """Body, motion, garments, scene and gate of a plan; if one of them cannot be made, the attempt has the reason."""
     attempt = Attempt(plan)
     try:
         body, transforms, frames = body_motion(plan, config)
         garments, cloths = clothed(plan, body, transforms)
-    except ValueError as error:  # a motion that cannot be cleared, a garment that cannot be cut for this body
+    except ValueError as error:  # the motion cannot be cleared, or a garment cannot be cut for this body
         attempt.reason = str(error)
         return attempt
     collider = body.collider_faces()
@@ -96,7 +97,7 @@ def simulate(attempts: list[Attempt], teacher: Teacher) -> None:
     live = [a for a in attempts if a.reason is None]
     if not live:
         return
-    scenes = [a.scene for a in live if a.scene is not None]  # all: one that could not be prepared has a reason
+    scenes = [a.scene for a in live if a.scene is not None]  # of all live attempts, which were prepared without fault
     stream: Iterator[Sequence[np.ndarray | None]]
     if len(live) == 1:
         stream = ([vertices] for vertices in teacher.simulate(scenes[0]))
@@ -116,12 +117,12 @@ def simulate(attempts: list[Attempt], teacher: Teacher) -> None:
 
 
 def manifest_of(attempt: Attempt, config: GenerateConfig, teacher: Teacher) -> dict[str, Any]:
-    """What is known about an attempt once it is simulated; a late failure cuts the sequence short before it."""
+    """The manifest of a simulated attempt; a late failure makes the sequence end before it."""
     plan, reason, kept = attempt.plan, attempt.reason, len(attempt.frames)
     cut_short = None
     if reason and kept > config.least_frames:
         cut_short, reason = reason, None
-        kept -= 5  # the frames before a failure are on their way to it
+        kept -= 5  # the frames just before a failure are already bad
     patterns = plan.outfit.layers
     return {
         "number": plan.number,
@@ -150,7 +151,7 @@ def manifest_of(attempt: Attempt, config: GenerateConfig, teacher: Teacher) -> d
 
 
 def make_sequences(config: GenerateConfig, numbers: list[int]) -> list[dict[str, Any]]:
-    """Makes sequences side by side and writes them; those rejected are drawn anew. Returns their manifests."""
+    """Makes sequences side by side, writes them and returns their manifests; rejected ones are drawn anew."""
     teacher = make_teacher(config.teacher, config.device)
     versions = package_versions()
     first = config.attempt or 0
@@ -186,7 +187,7 @@ def _arrays(attempt: Attempt, manifest: dict[str, Any], config: GenerateConfig) 
 
 
 def numbers_to_make(config: GenerateConfig) -> list[int]:
-    """Numbers of this shard that are not there yet, failed ones included."""
+    """Numbers of this shard whose sequences do not exist yet, including failed ones."""
     index, count = map(int, config.shard.split("/"))
     done = {p.parent.name.split("_")[0] for p in config.out.glob(f"[0-9]*_*/{MANIFEST}")}
     numbers = range(config.first, config.first + config.sequences)
@@ -194,11 +195,11 @@ def numbers_to_make(config: GenerateConfig) -> list[int]:
 
 
 def generate(config: GenerateConfig) -> Path:
-    """Makes the sequences that are not there yet; returns the data set's folder.
+    """Makes the sequences that do not exist yet; returns the folder of the data set.
 
     Raises:
         DatasetMismatch: The folder holds a set made with other options.
-        TeacherError: Sequences failed; the message says how many and why.
+        TeacherError: Sequences failed; the message has their number and the reason.
     """
     from tqdm import tqdm
 
@@ -213,8 +214,8 @@ def generate(config: GenerateConfig) -> Path:
     if config.bodies == "anny":
         from warpgarment.training.bodies.anny import anny_bodies
 
-        anny_bodies()  # builds the cache once, not in every worker
-    teacher = make_teacher(config.teacher, config.device)  # says now what is missing
+        anny_bodies()  # builds the cache once, before the workers start
+    teacher = make_teacher(config.teacher, config.device)  # raises errors about missing packages before any work
     config.out.mkdir(parents=True, exist_ok=True)
     numbers, planned = numbers_to_make(config), range(config.first, config.first + config.sequences)
     write_set_manifest(config.out, config.determining(), teacher.settings(), numbers=planned, command=config.command())

@@ -1,7 +1,7 @@
-"""Work spread over processes, each item in a process that may die without taking the others along.
+"""Work spread over processes that may die without affecting each other.
 
-`concurrent.futures` gives up on everything when one of its processes is killed. Here the item that process held is
-reported as lost, a new process takes its place, and the rest goes on.
+`concurrent.futures` abandons all work when one of its processes is killed. Here only the item of that process is
+reported as lost, a new process takes its place, and all other work continues.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Done:
-    """What became of an item: `result`, or `error` where its function raised or its process died."""
+    """The outcome of an item: its `result`, or an `error` if its function raised or its process died."""
 
     item: Any
     result: Any = None
@@ -25,12 +25,12 @@ class Done:
 
 
 def spread(function: Callable[[Any], Any], items: Iterable[Any], processes: int) -> Iterator[Done]:
-    """Calls `function(item)` for every item, in processes of their own; yields in the order they finish.
+    """Calls `function(item)` for every item, in separate processes; yields in the order in which the calls finish.
 
     Args:
-        function: Picklable: a function of a module, or a partial of one.
-        items: Picklable.
-        processes: How many at once.
+        function: Picklable function of one item, such as a function of a module or a partial of one.
+        items: Picklable arguments of the function.
+        processes: Number of processes at once.
     """
     waiting = list(items)[::-1]
     busy: dict[Connection, tuple[BaseProcess, Any]] = {}
@@ -41,7 +41,7 @@ def spread(function: Callable[[Any], Any], items: Iterable[Any], processes: int)
                 connection, process = idle.pop() if idle else _start(function)
                 try:
                     connection.send(waiting[-1])
-                except OSError:  # it died while it had nothing to do
+                except OSError:  # the process died while it was idle
                     connection.close()
                     continue
                 busy[connection] = process, waiting.pop()
@@ -65,11 +65,11 @@ def spread(function: Callable[[Any], Any], items: Iterable[Any], processes: int)
 
 def _start(function: Callable[[Any], Any]) -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(function, theirs), daemon=True)
+    near, far = context.Pipe()  # the ends of this process and of the new one
+    process = context.Process(target=_work, args=(function, far), daemon=True)
     process.start()
-    theirs.close()
-    return ours, process
+    far.close()
+    return near, process
 
 
 def _work(function: Callable[[Any], Any], connection: Connection) -> None:

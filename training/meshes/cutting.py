@@ -1,4 +1,4 @@
-"""Surface operations that garments are made with: cutting on a field, boundary loops, clearance, remeshing."""
+"""Surface operations for making garments: cutting along a field, boundary loops, clearance, remeshing."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from warpgarment.errors import MissingExtra
 
 from .sheet import EditableSheet
 
-_TOLERANCE = 0.04  # of the number of faces that remeshing aims at
+_TOLERANCE = 0.04  # largest relative error of the number of faces after remeshing
 
 
 def cut_below_zero(vertices: np.ndarray, faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Keeps the part of a surface where a vertex field is positive; triangles on the zero line are split.
 
     Args:
-        vertices: Shape [V, 3].
-        faces: Shape [F, 3].
-        field: Signed value per vertex, shape [V].
+        vertices: Positions [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        field: Signed value at each vertex, shape [V].
 
     Returns:
-        Vertices and faces of the largest connected piece that remains.
+        Vertices [V', 3] and faces [F', 3] of the largest connected piece that remains.
 
     Raises:
         ValueError: The field is positive nowhere.
@@ -39,15 +39,15 @@ def cut_below_zero(vertices: np.ndarray, faces: np.ndarray, field: np.ndarray) -
 def split_at_zero(
     vertices: np.ndarray, faces: np.ndarray, field: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Splits triangles where a vertex field, linear on each, is zero.
+    """Splits triangles along the line where a vertex field, linear on each triangle, is zero.
 
     Args:
-        vertices: Shape [V, 3].
-        faces: Shape [F, 3].
-        field: Signed value per vertex, shape [V].
+        vertices: Positions [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        field: Signed value at each vertex, shape [V].
 
     Returns:
-        Vertices, the old ones first; faces; and whether the field is positive on a face, bool [F].
+        Vertices, the old ones first, [V', 3]; faces, [F', 3]; whether the field is positive on a face, bool [F'].
     """
     field = np.where(np.abs(field) < 1e-5, 1e-5, field)
     inside = field > 0
@@ -65,7 +65,7 @@ def split_at_zero(
     whole = (count == 0) | (count == 3)
     parts, sides = [faces[whole]], [count[whole] == 3]
     for face in faces[~whole]:
-        alone = int(inside[face].sum()) == 1  # one corner on its side, two on the other
+        alone = int(inside[face].sum()) == 1  # one corner is inside, two are outside
         k = int(np.argmax(inside[face] == alone))
         i, j, l = (int(face[(k + n) % 3]) for n in range(3))
         p, q = middle(i, j), middle(i, l)
@@ -75,7 +75,7 @@ def split_at_zero(
 
 
 def without_specks(faces: np.ndarray, field: np.ndarray, least: int) -> np.ndarray:
-    """The field with negative islands of fewer than `least` vertices made positive: a cut there would leave a hole."""
+    """The field, [V], with negative islands of fewer than `least` vertices made positive, which would become holes."""
     inside = field > 0
     edges = igl.edges(faces)
     edges = edges[~inside[edges].any(1)]
@@ -86,19 +86,19 @@ def without_specks(faces: np.ndarray, field: np.ndarray, least: int) -> np.ndarr
 
 
 def largest_piece(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The connected piece with the most faces, unused vertices dropped."""
+    """Vertices and faces of the connected piece with the most faces, without unused vertices."""
     _, piece = igl.facet_components(faces.astype(np.int64))
     return compacted(vertices, faces[piece == np.bincount(np.asarray(piece).ravel()).argmax()])
 
 
 def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drops vertices that no face uses."""
+    """Vertices and faces of a mesh without the vertices that no face uses."""
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3)
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """The boundary loops of a manifold surface, longest first."""
+    """The boundary loops of a manifold surface, as vertex indices in order, the longest loop first."""
     loops = igl.boundary_loop_all(faces.astype(np.int64))
     return sorted((np.asarray(loop, dtype=np.int64) for loop in loops), key=len, reverse=True)
 
@@ -111,7 +111,16 @@ def averaging(faces: np.ndarray, count: int) -> sp.csr_matrix:
 
 
 def smoothed_boundary(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
-    """Averages boundary vertices along the boundary, which takes off the steps that a cut leaves."""
+    """Averages boundary vertices along the boundary for a number of rounds, which removes the steps that a cut leaves.
+
+    Args:
+        vertices: Positions [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        rounds: Number of rounds.
+
+    Returns:
+        Positions [m], shape [V, 3].
+    """
     points = vertices.copy()
     for loop in boundary_loops(faces):
         line = points[loop]
@@ -129,14 +138,25 @@ def pushed_out(
     gap: float,
     rounds: int = 8,
 ) -> np.ndarray:
-    """Moves vertices, and faces by their centres, that are nearer to a body than `gap` [m] out to that distance.
+    """Moves vertices and centres of faces that are nearer to a body than a gap out to that distance.
 
     Without the centres, the body would show through large faces whose vertices are clear of it.
+
+    Args:
+        vertices: Positions [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        body_vertices: Positions of the body [m], shape [U, 3].
+        body_faces: Vertex indices of the body, shape [G, 3].
+        gap: Least distance from the body [m].
+        rounds: Number of rounds; each moves all vertices and faces once.
+
+    Returns:
+        Positions [m], shape [V, 3].
     """
     points, sign = vertices.copy(), igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
     for _ in range(rounds):
         before = points.copy()
-        for corners in (faces, np.arange(len(points))[:, None]):  # vertices last: it is they that must keep the gap
+        for corners in (faces, np.arange(len(points))[:, None]):  # vertices last, because they must keep the gap
             centres = points[corners].mean(1)
             distance, _, closest, *_ = igl.signed_distance(
                 centres,
@@ -147,7 +167,7 @@ def pushed_out(
             outward = (centres - closest) * np.where(distance > 0, 1.0, -1.0)[:, None]
             outward /= np.linalg.norm(outward, axis=1, keepdims=True) + 1e-12
             move = outward * np.maximum(gap - distance, 0.0)[:, None]
-            order = np.argsort(-distance, kind="stable")  # where faces disagree, the last one written counts
+            order = np.argsort(-distance, kind="stable")  # the nearest is written last and counts where faces disagree
             pushed = np.zeros_like(points)
             pushed[corners[order].ravel()] = np.repeat(move[order], corners.shape[1], axis=0)
             points += pushed
@@ -163,12 +183,13 @@ def remeshed(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
     edges that stay too short are collapsed afterwards.
 
     Args:
-        vertices: Of a manifold sheet [m], shape [V, 3].
-        faces: Shape [F, 3].
-        target_faces: Hit within a few per cent, as long as the sheet's narrow parts are wider than an edge.
+        vertices: Positions of a manifold sheet [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        target_faces: Wanted number of faces; the result is within a few per cent of it, as long as the narrow parts of
+            the sheet are wider than an edge.
 
     Returns:
-        Vertices, faces, and the edge length of equilateral triangles that many to that area [m].
+        Vertices [m], [V', 3]; faces, [F', 3]; edge length of equilateral triangles of this number and total area [m].
 
     Raises:
         MissingExtra: gpytoolbox is not installed.
@@ -197,15 +218,16 @@ def remeshed(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
 
 
 def without_flat_ears(vertices: np.ndarray, faces: np.ndarray, limit: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-    """Removes triangles of three vertices of a straight border, two of whose edges are the border: they have no area.
+    """Removes triangles without area at a straight border, two of whose edges are border edges.
 
     Args:
-        vertices: Shape [V, 3].
-        faces: Shape [F, 3].
-        limit: Area, as a share of the mean, below which a triangle is removed.
+        vertices: Positions [m], shape [V, 3].
+        faces: Vertex indices, shape [F, 3].
+        limit: Area, as a share of the mean area, below which a triangle is removed.
 
     Returns:
-        The sheet without them and without the vertices only they had; its shape is the same.
+        Vertices and faces of the sheet without these triangles and without the vertices that only they used. The shape
+        of the sheet does not change.
     """
     while True:
         area = np.asarray(igl.doublearea(vertices, faces.astype(np.int64)))
@@ -220,10 +242,10 @@ def without_flat_ears(vertices: np.ndarray, faces: np.ndarray, limit: float = 1e
 
 
 def without_short_edges(vertices: np.ndarray, faces: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Collapses edges shorter than `limit` [m], shortest first, where the surface stays a manifold.
+    """Collapses edges shorter than `limit` [m], from the shortest on, if the surface stays a manifold.
 
-    The middle of an edge is what remains of it, except that boundary vertices stay where they are when an inner one
-    joins them. Edges across a strip, from boundary to boundary, are kept.
+    An edge becomes a vertex at its middle, except that a boundary vertex keeps its place when an inner vertex is joined
+    to it. Edges across a strip, from boundary to boundary, are kept.
     """
     sheet = EditableSheet(vertices, faces)
     queue: list[tuple[float, int, int]] = []
@@ -238,7 +260,7 @@ def without_short_edges(vertices: np.ndarray, faces: np.ndarray, limit: float) -
     while queue:
         length, a, b = heapq.heappop(queue)
         if b not in sheet.neighbours(a) or sheet.length(a, b) != length:
-            continue  # of an edge that is no more
+            continue  # the edge no longer exists
         border_a, border_b = sheet.on_boundary(a), sheet.on_boundary(b)
         if border_a and border_b and sheet.sharing(a, b) == 2:
             continue
@@ -251,7 +273,7 @@ def without_short_edges(vertices: np.ndarray, faces: np.ndarray, limit: float) -
 
 
 def evened_boundary(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gives boundary loops vertices at even distances of about `spacing` [m]: new ones are put in, others collapsed."""
+    """Spaces the vertices of boundary loops evenly, about `spacing` [m] apart, by inserting and collapsing vertices."""
     sheet = EditableSheet(vertices, faces)
     for loop in boundary_loops(faces):
         _even_loop(sheet, loop.tolist(), spacing)

@@ -1,4 +1,4 @@
-"""A triangle mesh that is edited one edge at a time: what remeshing needs beyond whole-array operations."""
+"""A triangle mesh that is edited one edge at a time, which remeshing needs besides whole-array operations."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ class EditableSheet:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         self.points = np.array(vertices, dtype=np.float64)
-        self._faces: list[list[int]] = faces.tolist()  # empty where a face is gone
+        self._faces: list[list[int]] = faces.tolist()  # a removed face is an empty list
         self._around: list[set[int]] = [set() for _ in range(len(vertices))]
         for f, face in enumerate(self._faces):
             for v in face:
                 self._around[v].add(f)
 
     def neighbours(self, vertex: int) -> set[int]:
-        """Vertices that share a face with one."""
+        """Vertices that share a face with a vertex."""
         return {v for f in self._around[vertex] for v in self._faces[f]} - {vertex}
 
     def sharing(self, a: int, b: int) -> int:
@@ -29,11 +29,15 @@ class EditableSheet:
         return len(self.neighbours(vertex)) != len(self._around[vertex])
 
     def length(self, a: int, b: int) -> float:
-        """Distance of two vertices [m]."""
+        """Distance between two vertices [m]."""
         return float(np.linalg.norm(self.points[a] - self.points[b]))
 
     def collapse(self, kept: int, gone: int) -> bool:
-        """Joins `gone` to `kept`, unless the surface would stop being a manifold (the link condition)."""
+        """Joins vertex `gone` to vertex `kept` unless the surface would stop being a manifold (the link condition).
+
+        Returns:
+            Whether the vertices were joined.
+        """
         shared = self._around[kept] & self._around[gone]
         if not shared or len(self.neighbours(kept) & self.neighbours(gone)) != len(shared):
             return False
@@ -48,7 +52,7 @@ class EditableSheet:
         return True
 
     def split(self, a: int, b: int, point: np.ndarray) -> int:
-        """Puts a vertex on a boundary edge."""
+        """Inserts a vertex at `point` [m] on a boundary edge and returns its index."""
         (f,) = self._around[a] & self._around[b]
         new = len(self.points)
         self.points = np.concatenate([self.points, point[None]])
@@ -64,7 +68,7 @@ class EditableSheet:
         return new
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices [V, 3] and faces [F, 3] that are left, vertices in their old order."""
+        """The remaining vertices [m], [V, 3], in their old order, and faces, [F, 3]."""
         faces = np.array([f for f in self._faces if f], dtype=np.int64)
         used, renumbered = np.unique(faces, return_inverse=True)
         return self.points[used], renumbered.reshape(-1, 3)

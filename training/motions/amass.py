@@ -19,7 +19,7 @@ from warpgarment.errors import MeshError
 
 from .clip import Clip, checked_finite, frame_rate
 
-# Our name, the parent's number and the offset from it [m] of SMPL's joints, in SMPL's order; Y up, facing +Z.
+# SMPL's joints in SMPL's order: name here, number of the parent, offset from the parent [m]; Y up, facing +Z.
 _JOINTS = (
     ("Hips", -1, (0.0, 0.0, 0.0)),
     ("LeftUpLeg", 0, (0.06, -0.09, 0.0)),
@@ -50,17 +50,18 @@ _UNREADABLE = (
     OSError, ValueError, EOFError, AttributeError, TypeError, KeyError, RuntimeError, TokenError, zipfile.BadZipFile,
     zlib.error,
 )  # fmt: skip
-_PELVIS = np.array([0.0, -0.22, 0.03])  # where the average body's root rests [m]; translations are relative to it
+_PELVIS = np.array([0.0, -0.22, 0.03])  # rest position of the average body's root [m]; translations start from it
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def read_amass(path: str | Path) -> Clip:
-    """Reads an AMASS-style .npz: `poses` [T, 66, 72, 156 or 165] axis-angles, `trans` [T, 3] [m], a frame rate.
+    """Reads an AMASS-style .npz: `poses` [T, 66, 72, 156 or 165] axis-angles [rad], `trans` [T, 3] [m], a frame rate.
 
     Gender and shape do not matter and are not read; nothing in the file is unpickled.
 
     Raises:
-        MeshError: The file is no .npz; keys are missing or have other shapes; NaN or infinity; an unknown frame rate.
+        MeshError: The file is no .npz, keys are missing or have other shapes, a number is not finite, or the frame
+            rate is unknown.
     """
     path = Path(path)
     arrays = _opened(path, ("poses", "trans"))
@@ -72,7 +73,7 @@ def read_amass(path: str | Path) -> Clip:
     checked_finite(trans, path.name)
     turns = Rotation.from_rotvec(poses[:, : 3 * len(_JOINTS)].reshape(-1, 3).astype(np.float64)).as_matrix()
     rotations = turns.reshape(len(poses), len(_JOINTS), 3, 3)
-    rotations[:, 0] = _Z_UP_TO_Y_UP @ rotations[:, 0]  # which turns SMPL's own axes, Y up, to the file's, Z up
+    rotations[:, 0] = _Z_UP_TO_Y_UP @ rotations[:, 0]  # the root turns SMPL's axes, Y up, to those of the file, Z up
     for joint, (_, parent, _) in enumerate(_JOINTS[1:], start=1):
         rotations[:, joint] = rotations[:, parent] @ rotations[:, joint]
     return Clip(
@@ -85,10 +86,10 @@ def read_amass(path: str | Path) -> Clip:
 
 
 def amass_length(path: str | Path) -> tuple[int, float]:
-    """Frames and frames per second of an AMASS file, from its headers.
+    """Number of frames and frames per second of an AMASS file, from its headers.
 
     Raises:
-        MeshError: As :func:`read_amass`, as far as headers tell.
+        MeshError: As in :func:`read_amass`, as far as the fault is visible in the headers.
     """
     path = Path(path)
     rate = _opened(path, ())["rate"]

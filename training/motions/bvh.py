@@ -16,7 +16,7 @@ _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def read_bvh(path: str | Path) -> Clip:
-    """Reads a BVH file; a Z-up file (the mean head is above the hips along Z) is turned Y up.
+    """Reads a BVH file; a file with Z up (the mean head is above the hips along Z) is turned to Y up.
 
     Raises:
         MeshError: The file is not BVH, its numbers do not match its hierarchy, or some are NaN or infinite.
@@ -53,10 +53,10 @@ def read_bvh(path: str | Path) -> Clip:
 
 
 def bvh_length(path: str | Path) -> tuple[int, float]:
-    """Frames and frames per second of a BVH file, from its header.
+    """Number of frames and frames per second of a BVH file, from its header.
 
     Raises:
-        MeshError: It has none.
+        MeshError: The file has no such header.
     """
     path = Path(path)
     frames = None

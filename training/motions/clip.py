@@ -1,4 +1,4 @@
-"""Motion clips on their own skeletons: what readers return, checked, and resampling in time."""
+"""Motion clips on their own skeletons, which readers return: checks, and resampling in time."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Clip:
 
     Attributes:
         names: Joint names, root first.
-        offsets: Offset of each joint from its parent in the zero pose, shape [J, 3].
+        offsets: Offset of each joint from its parent in the zero pose, in the file's unit of length, shape [J, 3].
         rotations: World rotation of each joint, shape [T, J, 3, 3].
-        root: Position of the root, shape [T, 3].
+        root: Position of the root in the file's unit of length, shape [T, 3].
         fps: Frames per second.
     """
 
@@ -36,7 +36,7 @@ def checked_finite(values: np.ndarray, file: str) -> None:
     """Refuses frames [T, ...] that hold NaN or infinity.
 
     Raises:
-        MeshError: Names how many and the first.
+        MeshError: Some frames do; the error names their number and the first one.
     """
     bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
     if bad.any():
@@ -47,25 +47,25 @@ def checked_finite(values: np.ndarray, file: str) -> None:
 
 
 def frame_rate(rate: float, file: str) -> float:
-    """Frames per second as written; what is within a hundredth of a percent of a whole number is that number.
+    """Frames per second of a file, rounded to a whole number if it is within a hundredth of a percent of it.
 
     BVH files write 120 fps as a frame time of 0.0083333.
 
     Raises:
-        MeshError: Not a rate that motions have.
+        MeshError: The rate is not between 1 and 2,000.
     """
-    if not 1.0 <= rate <= 2000.0:  # NaN, too
+    if not 1.0 <= rate <= 2000.0:  # refuses NaN, too
         raise MeshError(f"{file}: {rate:g} frames per second is no frame rate. Repair the file's header.")
     return float(round(rate)) if abs(rate - round(rate)) < 1e-4 * rate else float(rate)
 
 
 def resampled_length(frames: int, rate: float, fps: float) -> int:
-    """Number of frames after :func:`resampled`: those that lie within the clip."""
+    """Number of frames after :func:`resampled`; all of them lie within the clip."""
     return int((frames - 1) * fps / rate + 1e-6) + 1
 
 
 def resampled(clip: Clip, fps: float) -> Clip:
-    """The clip at another frame rate: rotations turn at constant speed between frames, the root moves straight."""
+    """The clip at another frame rate: between frames, rotations turn at constant speed and the root moves straight."""
     at = np.arange(resampled_length(len(clip), clip.fps, fps)) * (clip.fps / fps)
     before = np.minimum(np.round(at, 6).astype(int), len(clip) - 1)
     after = np.minimum(before + 1, len(clip) - 1)

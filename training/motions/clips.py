@@ -1,7 +1,8 @@
-"""Motions from files: clips read by suffix, and put on a body by world-space rotations.
+"""Motions from files: clips are read by suffix, and transferred to a body by world-space rotations.
 
-Retargeting copies each source bone's rotation from its zero pose, in the world, after turning the zero pose of the
-limbs onto the target's rest pose. Root translation is scaled by the ratio of leg lengths, so file units do not matter.
+Retargeting copies the rotation of each source bone from its zero pose, in world axes, after turning the zero pose of
+the limbs onto the target's rest pose. Root translation is scaled by the ratio of leg lengths, so file units do not
+matter.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ _LIMBS = {
     "LeftArm": "LeftForeArm", "LeftForeArm": "LeftHand", "RightArm": "RightForeArm", "RightForeArm": "RightHand",
 }  # fmt: skip
 _READERS = {".bvh": (read_bvh, bvh_length), ".npz": (read_amass, amass_length)}
-_FASTEST_ROOT = 12.0  # [m/s]; a sprinter's
-_FASTEST_BONE = 1800.0  # [degrees/s]; twice a runner's shin
+_FASTEST_ROOT = 12.0  # m/s, the speed of a sprinter
+_FASTEST_BONE = 1800.0  # degrees/s, twice the speed of a runner's shin
 
 
 def list_clips(folder: str | Path) -> list[Path]:
-    """The clips in a folder (.bvh and .npz files, not those in folders below), sorted by name; none is opened."""
+    """The clips in a folder (.bvh and .npz files, without subfolders), sorted by name; no file is opened."""
     return sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in _READERS and p.is_file())
 
 
@@ -50,16 +51,16 @@ def read_clip(path: str | Path) -> Clip:
     """Reads a clip by its suffix: .bvh or AMASS .npz.
 
     Raises:
-        MeshError: Another suffix, or a file that is damaged.
+        MeshError: The suffix is another, or the file is damaged.
     """
     return _reader(path)[0](path)
 
 
 def clip_frames(path: str | Path, fps: float = 30.0) -> int:
-    """Frames that a clip has after :func:`retarget` to a frame rate; only the file's header is read.
+    """Number of frames of a clip after :func:`retarget` to a frame rate; only the file's header is read.
 
     Raises:
-        MeshError: Another suffix, or no header.
+        MeshError: The suffix is another, or there is no header.
     """
     frames, rate = _reader(path)[1](path)
     return resampled_length(frames, rate, fps)
@@ -73,10 +74,10 @@ def _reader(path: str | Path) -> tuple[Callable[..., Clip], Callable[[str | Path
 
 
 def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
-    """The clip on another body, resampled to `fps`.
+    """The clip on another body, resampled to `fps` frames per second.
 
     Raises:
-        MeshError: The clip's joints are named neither as CMU MotionBuilder nor as DAZ names them.
+        MeshError: The clip's joints have neither the names of CMU MotionBuilder nor those of DAZ.
     """
     source = {name: name if name in clip.names else _DAZ.get(name) for name in body.bone_names}
     source = {name: s if s in clip.names else None for name, s in source.items()}
@@ -100,10 +101,11 @@ def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
 
 
 def jumps(body: RestBody, poses: PoseSequence) -> np.ndarray:
-    """Frames to which the body cannot have moved from the frame before, bool [T]: markers were lost or swapped.
+    """Frames that the body cannot have reached from the frame before, bool [T]: markers were lost or swapped.
 
-    The root is faster than 12 m/s, or a bone of the trunk, head, thighs, shins or arms than 1,800 degrees a second.
-    Hands, feet and toes, whose few markers often flicker, move little cloth and may.
+    In these frames the root is faster than 12 m/s, or a bone of the trunk, head, thighs, shins or arms is faster than
+    1,800 degrees per second. Hands, feet and toes are ignored: their few markers often flicker, but they move little
+    cloth.
     """
     carried = {b for name in ("Hand", "Foot") for side in ("Left", "Right") for b in body.chain(side + name)}
     bones = [b for b in range(len(body.bone_names)) if b not in carried]
@@ -116,7 +118,7 @@ def jumps(body: RestBody, poses: PoseSequence) -> np.ndarray:
 
 
 def _limb_alignment(clip: Clip, body: RestBody, source: dict[str, str | None], bone: str, child: str) -> np.ndarray:
-    """Smallest rotation from the target's rest direction of a limb to the source's zero-pose direction."""
+    """The smallest rotation from the rest direction of the target's limb to its direction in the source's zero pose."""
     a = body.joint(child) - body.joint(bone)
     b = clip.offsets[clip.names.index(source[child])]
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)

@@ -1,8 +1,8 @@
 """Motions made by formula: walking, running, turning, jumping, bending, lifting the arms.
 
-They need no files, so the demo and anyone without motion capture can use them. Joint angles are low-order Fourier
-curves of the gait phase in the manner of normal gait data (hip about +-25 degrees, knee up to 60 in swing), the root's
-height follows from the lower foot; they are meant to move cloth plausibly, not to pass for motion capture.
+They need no files, so the demo and users without motion capture can use them. Joint angles are low-order Fourier curves
+of the gait phase that resemble normal gait data (hip about +-25 degrees, knee up to 60 in swing); the root's height
+follows from the lower foot. These motions move cloth plausibly but do not replace motion capture.
 """
 
 from __future__ import annotations
@@ -18,17 +18,24 @@ KINDS = ("walk", "run", "turn", "jump", "bend", "arms")
 
 
 def procedural(body: RestBody, kind: str, frames: int, seed: int, fps: float = 30.0) -> PoseSequence:
-    """A motion of one of :data:`KINDS`, with speed, stride and sway drawn from the seed.
+    """A motion of one of :data:`KINDS`.
+
+    Args:
+        body: Body that moves.
+        kind: Kind of motion, one of :data:`KINDS`.
+        frames: Number of frames.
+        seed: Seed from which speed, stride and sway are drawn.
+        fps: Frames per second.
 
     Raises:
-        ValueError: Unknown kind.
+        ValueError: The kind is unknown.
     """
     if kind not in KINDS:
         raise ValueError(f"unknown procedural motion {kind!r}; there are {', '.join(KINDS)}")
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     time = np.arange(frames) / fps
     ease = np.clip(time / 0.8, 0, 1)
-    ease = ease * ease * (3 - 2 * ease)  # everything starts from standing
+    ease = ease * ease * (3 - 2 * ease)  # every motion starts from standing
     curves = {"run": _run, "jump": _jump, "bend": _bend, "arms": _arms}.get(kind, _walk)(time, ease, rng)
     if kind == "turn":
         curves["turn_rate"] = ease * rng.choice([-1, 1]) * np.radians(rng.uniform(40, 90))
@@ -121,7 +128,7 @@ def _arms(time: np.ndarray, ease: np.ndarray, rng: np.random.Generator) -> dict[
 
 
 def _assemble(body: RestBody, curves: dict[str, np.ndarray], fps: float) -> PoseSequence:
-    """Joint angles about the body's axes (X to its left, Y up, Z forward) to world rotations."""
+    """World rotations from joint angles about the body's axes (X to its left, Y up, Z forward)."""
     frames = len(curves["lean"])
     zero = np.zeros(frames)
 
@@ -153,7 +160,7 @@ def _assemble(body: RestBody, curves: dict[str, np.ndarray], fps: float) -> Pose
     forward, left = facing[:, :, 2], facing[:, :, 0]
     root = np.cumsum(forward * curves["speed"][:, None], axis=0) / fps + left * curves["sway"][:, None]
     height = _standing(body, rotations, fps) + curves["flight"]
-    root[:, 1] = gaussian_filter1d(height, 0.05 * fps, mode="nearest")  # feet change, land and leave without a jolt
+    root[:, 1] = gaussian_filter1d(height, 0.05 * fps, mode="nearest")  # no jolts when feet land, leave or alternate
     return PoseSequence(rotations, root, fps)
 
 

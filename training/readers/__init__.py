@@ -1,9 +1,9 @@
-"""Readers for data sets others have made: files in, a `Recording` in SI units and Y up out.
+"""Readers for data sets that others have made; they return a `Recording` in SI units with Y up.
 
     recording = read_recording("CLOTH3D/train/01_01_s0", body=smpl)       # the format is found by content
     write_as_sequence(recording, "DATA/01_01_s0", split="train")          # `warpgarment train --data DATA`
 
-See docs/readers.md. Nothing in a file is ever executed.
+See docs/readers.md. No reader executes anything in a file.
 """
 
 from .cloth3d import read_cloth3d

@@ -1,4 +1,4 @@
-"""Axes: files have Z up as often as Y."""
+"""Conversion between axes with Y up and with Z up."""
 
 from __future__ import annotations
 

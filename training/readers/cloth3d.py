@@ -9,12 +9,12 @@ A sample is a folder, named after the clip and the subject (01_01_s0):
   0.15 rad each), already turned by `zrot`;
 - ``<Garment>.pc16``: positions relative to the pelvis, not yet turned, as 16-bit floats (see `pc16`).
 
-Metres, Z up. Where a garment is: Rz(zrot) (V + trans). SMPL's pelvis is moved to the origin before posing, so `trans`
-is where it goes. From the data set's description and its authors' public tools (the starter kit; DeePSD for the turned
-rest shapes).
+Units are metres with Z up. A garment's positions are Rz(zrot) (V + trans). SMPL's pelvis is moved to the origin before
+posing, so `trans` is its position. This is known from the data set's description and its authors' public tools (the
+starter kit; DeePSD for the turned rest shapes).
 
-What the data set does not say: which garment is worn over which (the order of `outfit` is kept), the numbers behind a
-fabric's name (`attributes` keeps the name, `materials` stay unknown), and the rate, taken to be 30 fps.
+The data set does not specify which garment is worn over which (the order of `outfit` is kept), the numbers behind a
+fabric's name (`attributes` keeps the name, `materials` are unknown), and the rate, which is taken to be 30 fps.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ VARIABLES = ("poses", "trans", "shape", "gender", "zrot", "outfit", "tightness")
 
 
 def read_cloth3d(folder: str | Path, *, body: BodySource = None, fps: float = 30.0, clean: bool = False) -> Recording:
-    """Reads a sample. Garments stand where the data set's own tools put them, but Y up.
+    """Reads a sample. Garments are in the positions that the data set's own tools give them, but with Y up.
 
     Args:
-        folder: The sample's folder.
-        body: The body's motion, or a function that makes it of the sample's SMPL poses; see `smpl.body_from`.
+        folder: Folder of the sample.
+        body: Motion of the body, or a function that makes it from the sample's SMPL poses; see `smpl.body_from`.
         fps: Frames per second.
-        clean: Repair rest meshes that a garment cannot have; the frames follow.
+        clean: Whether rest meshes that are not valid for a garment are repaired; the frames follow.
 
     Raises:
-        MeshError: A file is missing, cut short or of another version, or files do not fit each other.
+        MeshError: A file is missing, truncated or of another version, or files do not fit each other.
     """
     folder = Path(folder)
     if not (folder / INFO).is_file():
@@ -92,7 +92,7 @@ def _check_files(folder: Path, names: list[str]) -> None:
 
 
 def _garment(folder: Path, name: str, turn: Rotation, trans: np.ndarray, clean: bool) -> RecordedGarment:
-    """`trans` is turned already; the positions of the cache are not."""
+    """One garment. `trans` [m] is turned already; the positions of the cache are not."""
     cache, mesh = folder / f"{name}.pc16", folder / f"{name}.obj"
     frames, (rest, faces) = read_pc16(cache), read_obj(mesh)
     if frames.shape[1] != len(rest):
@@ -135,7 +135,7 @@ def _columns(folder: Path, info: dict[str, Any], name: str, rows: int) -> np.nda
 
 
 def _number(folder: Path, info: dict[str, Any], name: str) -> float:
-    """A scalar; 0 where it is missing."""
+    """A scalar variable; 0 if it is missing."""
     array = np.ravel(np.asarray(info.get(name, 0.0)))
     if array.size != 1 or array.dtype.kind not in "fiub" or not np.isfinite(array[0]):
         raise MeshError(f"{folder / INFO}: {name} must be one finite number.")

@@ -1,25 +1,26 @@
 """D-LAYERS (Shao, Loy, Dai, ICCV 2023): layered outfits on SMPL bodies in the wind, simulated with Blender.
 
-    ROOT/data/00396/meta.json              what the sample is made of
-    ROOT/data/00396/<garment>.pkl          {"vertices" [T,V,3], "faces" [F,3], "tpose" [V,3]}, one a garment
+    ROOT/data/00396/meta.json              parts and settings of the sample
+    ROOT/data/00396/<garment>.pkl          {"vertices" [T,V,3], "faces" [F,3], "tpose" [V,3]}, one per garment
     ROOT/data/00396/uv_<garment>.pkl       texture coordinates (not read)
     ROOT/<motion_path of meta.json>        {"poses" [N,72], "trans" [N,3]} of the whole clip
 
 `meta.json` has `human` (gender, betas, motion_path, seq_start, seq_end, frame_start, scale, collision), `garment` (a
 list of name and `cloth`, Blender's settings) and `wind` (one field with a `pivot_list` of frame_start,
-rotation_quaternion (w, x, y, z) and strength, along its own +Z; each holds until the next). Some releases have them
-under `simulate`. Everything is `scale` = 10 times life size and Z up; here it is life size and Y up. The pickles are
-read by `unpickle`, which executes nothing.
+rotation_quaternion (w, x, y, z) and strength, along its own +Z; each entry is valid until the next). Some releases have
+them under `simulate`. All lengths are `scale` = 10 times life size, with Z up; the recording has life size and Y up.
+The pickles are read by `unpickle`, which executes nothing.
 
-Known from the authors' two public readers and the paper's supplement; no sample was at hand. **Not verified**:
+All this is known from the authors' two public readers and the paper's supplement; no sample was available. **Not
+verified** are
 
 - that the T-pose shape is Y up, SMPL's own axes (the authors' viewer draws it beside SMPL's zero pose);
 - the order of layers: `garment` as listed, but jackets, the paper's outer garments, last;
 - the rate of 30 fps, which is the clips';
-- Blender's gravity: if it was left at 9.81, things fall at 0.88 m/s^2 at life size, 30 frames a second.
+- Blender's gravity: if it was left at 9.81, things fall at 0.88 m/s^2 at life size, 30 frames per second.
 
-Garments with more frames than the clip are cut to it, as in the authors' own training. Blender's settings of cloth and
-wind are kept in `attributes`; `materials` and `wind` are what they come to in SI units, see `blender_cloth`.
+Garments with more frames than the clip are cut to its length, as in the authors' own training. Blender's settings of
+cloth and wind are kept in `attributes`; `materials` and `wind` are these settings in SI units, see `blender_cloth`.
 """
 
 from __future__ import annotations
@@ -50,13 +51,13 @@ def read_dlayers(
     """Reads a sample. Nothing in its pickles is executed.
 
     Args:
-        folder: The sample's folder, with `meta.json`.
-        body: The body's motion, or a function that makes it of the sample's SMPL poses; see `smpl.body_from`.
-        root: What `motion_path` is relative to; by default two folders up.
-        clean: Repair rest meshes that a garment cannot have; the frames follow.
+        folder: Folder of the sample, with `meta.json`.
+        body: Motion of the body, or a function that makes it from the sample's SMPL poses; see `smpl.body_from`.
+        root: Folder to which `motion_path` is relative; None for the one two levels above `folder`.
+        clean: Whether rest meshes that are not valid for a garment are repaired; the frames follow.
 
     Raises:
-        PickleRefused: A pickle holds something besides plain data, or is damaged.
+        PickleRefused: A pickle holds something other than plain data, or is damaged.
         MeshError: A file or a field of `meta.json` is missing, or files do not fit each other.
     """
     folder = Path(folder)
@@ -136,7 +137,7 @@ def _garment(folder: Path, name: str, scale: float, count: int, clean: bool) -> 
 
 
 def _array(path: Path, data: Any, key: str, kinds: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """An array of a dictionary, or a list of arrays of one shape; None in `shape` is any size."""
+    """An array, or a list of arrays of one shape, from a dictionary; None in `shape` stands for any size."""
     array = data.get(key) if isinstance(data, dict) else None
     if isinstance(array, list) and array and all(isinstance(part, np.ndarray) for part in array):
         array = np.stack(array) if len({part.shape for part in array}) == 1 else None
@@ -179,7 +180,7 @@ def _pivots(folder: Path, meta: dict[str, Any]) -> list[dict[str, Any]]:
 def _wind(
     folder: Path, human: dict[str, Any], pivots: list[dict[str, Any]], frames: int, ratio: float, scale: float
 ) -> np.ndarray | None:
-    """Velocity of the air [m/s], Y up."""
+    """Velocity of the air in each frame [m/s], Y up, shape [T, 3]; None for still air."""
     wind = np.zeros((frames, 3))
     try:
         for pivot in sorted(pivots, key=lambda p: p["frame_start"]):

@@ -1,4 +1,4 @@
-"""Garment animations and a body animation in PC2, OBJ sequences, USD or NPZ, put together.
+"""Recordings from garment animations and a body animation in PC2, OBJ sequences, USD or NPZ.
 
 recording("dress.pc2", "body.pc2", fps=30)                        # with dress.obj and body.obj beside them
 recording(["shirt/", "jacket/"], "body.npz", unit="cm")           # folders of .obj, innermost first
@@ -24,9 +24,9 @@ from warpgarment.objects.material import Material
 from .recording import RecordedGarment, Recording, recorded_garment
 
 Source = str | os.PathLike | tuple[str | os.PathLike, str]
-FPS = 30.0  # where no file says
-SMALLEST, LARGEST = 0.03, 3.0  # a garment's height over the body's, beyond which their units differ
-FARTHEST = 3.0  # body heights between their centres, beyond which they do not belong together
+FPS = 30.0  # frames per second if no file specifies a rate
+SMALLEST, LARGEST = 0.03, 3.0  # limits of a garment's height over the body's; outside them, their units differ
+FARTHEST = 3.0  # largest distance of their centres in body heights; further apart, they do not belong together
 
 
 def recording(
@@ -41,23 +41,24 @@ def recording(
     materials: Sequence[Material | None] = (),
     wind: np.ndarray | None = None,
 ) -> Recording:
-    """Puts animations of garments and of the body under them together.
+    """A recording of animations of garments and of the body under them.
 
     Args:
-        garment: A file or folder as `BodyMotion.load` reads them, or several, innermost first; (file, mesh) names one
-            mesh of a USD stage.
-        body: The same for the body; a `BodyMotion`; None: no body.
-        rest: Rest shapes, one mesh file a garment, with the same vertices in the same order. By default the mesh beside
-            a .pc2, else the first frame.
-        fps: Frames per second; overrides the files', which must agree otherwise. 30 where none says.
+        garment: File or folder that `BodyMotion.load` reads, or several, innermost first; (file, mesh) names one mesh
+            of a USD stage.
+        body: File or folder of the body, in the forms of `garment`, or a `BodyMotion`; None for no body.
+        rest: Rest shapes, one mesh file per garment, with the vertices in the order of the animation. None takes the
+            mesh beside a .pc2, otherwise the first frame.
+        fps: Frames per second, in place of the files' rates; None takes their rate, which must be the same in all
+            files, or 30 if no file has one.
         unit: Length unit of the files: "m", "dm", "cm", "mm", "in"; see `Garment.load`.
-        body_unit: That of the body, where it is another.
-        clean: Repair rest meshes that a garment cannot have; the frames follow.
-        materials: One a garment, where known.
-        wind: Velocity of the air [m/s], [T, 3].
+        body_unit: Length unit of the body's file; None for that of the garments.
+        clean: Whether rest meshes that are not valid for a garment are repaired; the frames follow.
+        materials: Material of each garment, None where it is not known; empty if none is known.
+        wind: Velocity of the air in each frame [m/s], [T, 3].
 
     Raises:
-        MeshError: Frames, rates, vertices or sizes that do not fit each other, or a damaged file.
+        MeshError: Frames, rates, vertices or sizes do not fit each other, or a file is damaged.
         FileNotFoundError: There is no such file.
 
     Warns:
@@ -86,7 +87,7 @@ def recording(
 
 
 def _is_one(source: Sequence) -> bool:
-    """Whether a tuple is (file, mesh): a stage and a name, rather than two files."""
+    """Whether a tuple is (file, mesh), a USD stage and the name of a mesh, rather than two files."""
     return (
         isinstance(source, tuple)
         and len(source) == 2
@@ -129,7 +130,7 @@ def _garment(
         raise MeshError(f"{rest} has {len(still.vertices):,} vertices, {path} {frames.shape[1]:,}.")
     others = np.asarray(still.faces)
     same = others.shape == faces.shape and (np.sort(others, axis=1) == np.sort(faces, axis=1)).all(axis=1).mean() > 0.5
-    if not same:  # a few may differ: bent quads are split one way or the other
+    if not same:  # a few faces may differ, since bent quads can be split along either diagonal
         raise MeshError(f"{rest} and {path} have other faces: they must share one topology and order.")
     return recorded_garment(name, np.asarray(still.vertices), others, frames, where=str(path), clean=clean)
 
@@ -158,7 +159,7 @@ def _rate(fps: float | None, rates: dict[str, float]) -> float:
 
 
 def _check_place(garment: RecordedGarment, body: BodyMotion, names: str) -> None:
-    """Raises MeshError unless both are, in the first frame, of such sizes and in such places as go together."""
+    """Raises MeshError unless sizes and places of garment and body fit each other in the first frame."""
     firsts = (garment.vertices[0].astype(np.float64), body.vertices[0].astype(np.float64))
     size, height = (float(np.ptp(first, axis=0).max()) for first in firsts)
     if not SMALLEST <= size / height <= LARGEST:

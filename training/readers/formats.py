@@ -1,4 +1,4 @@
-"""Which format a file or folder is in, by what it holds, and one call that reads any of them."""
+"""Detection of a file's or folder's format from its contents, and one function that reads all formats."""
 
 from __future__ import annotations
 
@@ -35,44 +35,44 @@ def read_recording(path: str | Path, format: str | None = None, **options: Any) 
     """Reads a sample of a public data set, or an animation of one garment.
 
     Args:
-        path: File or folder.
-        format: One of `READERS`; by default what :func:`detect` finds.
-        options: Of the format's reader; all take `body` and `clean`.
+        path: File or folder to read.
+        format: Format, one of `READERS`; None for the result of :func:`detect`.
+        options: Options of the format's reader; all readers take `body` and `clean`.
 
     Raises:
-        MeshError: The format is not known, holds no garment, or the files are damaged or do not fit each other.
+        MeshError: The format is not known or holds no garment, or the files are damaged or do not fit each other.
         FileNotFoundError: There is no such file.
-        TypeError: An option that the format's reader does not have.
+        TypeError: The format's reader does not have one of the options.
     """
-    found = format or detect(path)
-    if found == "amass":
+    kind = format or detect(path)
+    if kind == "amass":
         raise MeshError(
             f"{path} is an AMASS motion: it moves a body and has no garment. Read it with training.motions.read_amass, "
             "or give its folder to `warpgarment generate --motions`."
         )
-    if found not in READERS:
-        raise MeshError(f"the format {found!r} is not known; there are {', '.join(READERS)}.")
-    return READERS[found](path, **options)
+    if kind not in READERS:
+        raise MeshError(f"the format {kind!r} is not known; there are {', '.join(READERS)}.")
+    return READERS[kind](path, **options)
 
 
 def detect(path: str | Path) -> str:
-    """The format of a file or folder, one of `FORMATS`. Nothing is executed, and little is read.
+    """The format of a file or folder, one of `FORMATS`. Nothing is executed, and only a small part is read.
 
     Raises:
-        MeshError: None of the known ones; says what was looked for.
+        MeshError: The format is none of the known ones; the message lists them.
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"No such file: {path}")
-    found = _folder(path) if path.is_dir() else _file(path)
-    if found is None:
+    kind = _folder(path) if path.is_dir() else _file(path)
+    if kind is None:
         raise MeshError(
             f"{path}: not recognised. Known are the folder of a CLOTH3D sample ({cloth3d.INFO} and .pc16) or of a "
             f"D-LAYERS sample ({dlayers.META} and .pkl), a VTO sequence (.pkl), a folder of .obj, .pc2, USD, .npz, and "
             "AMASS motions (.npz)."
         )
-    return found
+    return kind
 
 
 def _folder(path: Path) -> str | None:
@@ -82,7 +82,7 @@ def _folder(path: Path) -> str | None:
         try:
             meta = json.loads((path / dlayers.META).read_text("utf-8"))
         except (ValueError, RecursionError):
-            return "dlayers"  # whose reader says what is wrong
+            return "dlayers"  # its reader reports the fault
         parts = [meta, meta.get("simulate")] if isinstance(meta, dict) else []
         return "dlayers" if any(isinstance(part, dict) and "garment" in part for part in parts) else None
     return "obj" if next(path.glob("*.obj"), None) else None
@@ -117,7 +117,7 @@ def _archive(path: Path) -> str | None:
             names = {Path(name).stem for name in archive.namelist() if name.endswith(".npy")}
             stage = any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in archive.namelist()[:1])
     except (zipfile.BadZipFile, OSError):
-        return "npz" if path.suffix.lower() == ".npz" else None  # whose reader says what is wrong
+        return "npz" if path.suffix.lower() == ".npz" else None  # the reader of .npz reports the fault
     if stage:
         return "usd"
     if {"poses", "trans"} <= names and "vertices" not in names:
@@ -128,7 +128,7 @@ def _archive(path: Path) -> str | None:
 
 
 def _pickle(path: Path) -> str | None:
-    """By the words in it, which are not read as a pickle here."""
+    """The format of a pickle, from the words in the file; it is not read as a pickle here."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         if data.find(b"tpose") >= 0 and data.find(b"vertices") >= 0:
             raise MeshError(f"{path} is a garment of a D-LAYERS sample. Give the folder it lies in.")

@@ -16,10 +16,10 @@ from warpgarment.io.pc2 import HEADER, SIGNATURE
 
 
 def read_pc16(path: str | Path) -> np.ndarray:
-    """Positions of a PC16 file in its unit, float32, shape [T, V, 3]. Start and rate of the header are not used.
+    """Positions of a PC16 file in its own unit, float32, shape [T, V, 3]. Start and rate of the header are not used.
 
     Raises:
-        MeshError: Another signature or version, or not as many bytes as the header says.
+        MeshError: The signature or version is another, or the number of bytes is not that of the header.
         FileNotFoundError: There is no such file.
     """
     path = Path(path)

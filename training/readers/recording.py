@@ -1,4 +1,4 @@
-"""What every reader returns: garments in motion, the body under them, and what is known of cloth and air."""
+"""The result of every reader: garments in motion, the body under them, and the known properties of cloth and air."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class RecordedGarment(NamedTuple):
     """One garment of a recording.
 
     Attributes:
-        rest: Rest mesh [m].
-        vertices: Its vertices in every frame [m], Y up, float32 [T, V, 3].
+        rest: Garment with its rest mesh [m].
+        vertices: Vertices of the garment in every frame [m], Y up, float32 [T, V, 3].
     """
 
     rest: Garment
@@ -35,17 +35,18 @@ class Recording:
     """A simulated or captured sequence in SI units, Y up.
 
     Attributes:
-        garments: Innermost first.
-        body: The body under them; None where the data set holds poses only (see `poses`) or nothing.
+        garments: Garments, innermost first.
+        body: Body under the garments; None if the data set has only poses (see `poses`) or no body at all.
         fps: Frames per second.
-        materials: One for each garment, None where it is not known.
-        wind: Velocity of the air in each frame [m/s], float32 [T, 3]; None: still, or not known.
+        materials: Material of each garment, None where it is not known.
+        wind: Velocity of the air in each frame [m/s], float32 [T, 3]; None if the air is still or not known.
         source: Format and file, for messages and manifests.
-        poses: SMPL parameters, where the data set describes the body by them.
-        attributes: What else the files say, as plain values.
+        poses: SMPL parameters, if the data set describes the body by them.
+        attributes: Other data of the files, as plain values.
 
     Raises:
-        MeshError: No garments, or frames, rates, counts or shapes that do not fit each other; named by part.
+        MeshError: There are no garments, or frames, rates, counts or shapes do not fit each other; the error names the
+            part.
     """
 
     garments: tuple[RecordedGarment, ...]
@@ -98,7 +99,10 @@ class Recording:
         return len(self.garments[0].vertices)
 
     def resampled(self, fps: float) -> Recording:
-        """The recording at another rate, positions interpolated linearly in time; SMPL poses are left out.
+        """The recording at another rate, with positions interpolated linearly in time and without SMPL poses.
+
+        Args:
+            fps: New frames per second.
 
         Raises:
             MeshError: The rate is not positive.
@@ -121,18 +125,18 @@ class Recording:
 def recorded_garment(
     name: str, rest: np.ndarray, faces: np.ndarray, frames: np.ndarray, *, where: str, clean: bool = False
 ) -> RecordedGarment:
-    """A garment from what a file holds, checked.
+    """A garment from the arrays of a file, after checks.
 
     Args:
-        name: For messages and manifests.
+        name: Name of the garment, for messages and manifests.
         rest: Rest positions [m], shape [V, 3].
-        faces: Triangles, shape [F, 3].
+        faces: Vertex indices of triangles, shape [F, 3].
         frames: Positions [m], Y up, shape [T, V, 3].
-        where: The file, for messages.
-        clean: Repair the rest mesh as `Garment.cleaned_from` does; the frames follow their vertices.
+        where: Name of the file, for messages.
+        clean: Whether the rest mesh is repaired as by `Garment.cleaned_from`; the frames follow their vertices.
 
     Raises:
-        MeshError: Another number of vertices, frames that are not finite, or a mesh that a garment cannot have.
+        MeshError: Numbers of vertices differ, a frame is not finite, or the mesh is not valid for a garment.
     """
     if frames.ndim != 3 or frames.shape[1:] != np.shape(rest):
         raise MeshError(
@@ -141,7 +145,7 @@ def recorded_garment(
         )
     if clean:
         rest, faces, went = clean_mesh(rest, faces)
-        kept = np.flatnonzero(went >= 0)[::-1]  # backwards, so that of merged vertices the first speaks
+        kept = np.flatnonzero(went >= 0)[::-1]  # backwards, so that of merged vertices the first one counts
         origin = np.empty(len(rest), dtype=np.int64)
         origin[went[kept]] = kept
         frames = frames[:, origin]

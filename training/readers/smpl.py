@@ -1,7 +1,7 @@
 """Bodies that a data set describes by SMPL parameters.
 
-The SMPL model has a licence of its own and does not come with this package, so the body's surface is made by the user:
-readers take `body=` as a `BodyMotion`, or as a function that gets these poses and returns vertices and faces.
+The SMPL model has a licence of its own and does not come with this package, so the user makes the body's surface:
+readers take `body=` as a `BodyMotion`, or as a function from these poses to vertices and faces.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from warpgarment.objects.body import BodyMotion
 
 from .axes import y_up, z_up
 
-BODY_JOINTS = 22  # those that SMPL and SMPL-H share; SMPL adds two hands, SMPL-H thirty finger joints
+BODY_JOINTS = 22  # number of joints that SMPL and SMPL-H share; SMPL adds two hands, SMPL-H thirty finger joints
 AMASS_JOINTS = 52
 
 
@@ -27,18 +27,19 @@ AMASS_JOINTS = 52
 class SmplPoses:
     """SMPL parameters of a sequence, in the data set's axes.
 
-    A vertex v of the shaped body with the pelvis at J goes to R (v - J) + trans where `centred`, and to
-    R (v - J) + J + trans, SMPL's own convention, where not; R is the first rotation, the other joints posed before.
+    A vertex v of the shaped body with the pelvis at J goes to R (v - J) + trans if `centred`, otherwise to
+    R (v - J) + J + trans, which is SMPL's own convention. R is the first rotation; the other joints are posed before.
 
     Attributes:
-        rotations: Axis-angle of each joint relative to its parent [rad], the whole body's first, shape [T, 24, 3].
+        rotations: Axis-angle of each joint relative to its parent [rad], that of the whole body first, shape
+            [T, 24, 3].
         trans: Translation [m], shape [T, 3].
-        betas: Shape coefficients, [S], or [T, S] where they change.
+        betas: Shape coefficients, [S], or [T, S] if they change.
         gender: "female", "male" or "neutral".
         fps: Frames per second.
         up: "y" or "z".
-        centred: The pelvis is at `trans` (True), or at `trans` and its rest position (False).
-        source: The file, for messages.
+        centred: Whether the pelvis is at `trans`; otherwise it is at `trans` plus its rest position.
+        source: Name of the file, for messages.
     """
 
     rotations: np.ndarray
@@ -69,7 +70,7 @@ class SmplPoses:
         return len(self.rotations)
 
     def turned(self, turn: Rotation) -> SmplPoses:
-        """The same motion of a centred body, turned about the origin."""
+        """The motion of a centred body, turned about the origin."""
         rotations = self.rotations.copy()
         rotations[:, 0] = (turn * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
         return replace(self, rotations=rotations, trans=turn.apply(self.trans))
@@ -77,8 +78,8 @@ class SmplPoses:
     def save_amass(self, path: str | Path) -> None:
         """Writes the motion as an AMASS .npz (Z up), which `training.motions.read_amass` reads.
 
-        The 22 joints that SMPL and SMPL-H share; fingers straight. Where the pelvis rests is not known without the
-        model, so translations may be off by a constant.
+        The file has the 22 joints that SMPL and SMPL-H share, and straight fingers. The rest position of the pelvis is
+        not known without the model, so translations may be off by a constant.
         """
         rotations, trans = self.rotations.astype(np.float64), self.trans.astype(np.float64)
         if self.up == "y":
@@ -103,16 +104,15 @@ BodySource = BodyMotion | str | Path | Callable[[SmplPoses], tuple[np.ndarray, n
 
 
 def body_from(body: BodySource, poses: SmplPoses | None) -> BodyMotion | None:
-    """The body that a reader was given, or that the given function makes of the poses.
+    """The body that a reader was given, or that a given function makes from the poses.
 
     Args:
-        body: A motion (metres, Y up, in the recording's place) or its file; a function from poses to vertices
-            [T, U, 3] in the axes of the poses and faces [F, 3]; or None.
-        poses: What the function gets; None: the files hold none.
+        body: Motion (metres, Y up, in the place of the recording) or its file, or a function from poses to vertices
+            [m], [T, U, 3], in the axes of the poses and faces, [F, 3]; None for no body.
+        poses: Argument of the function; None if the files have no poses.
 
     Raises:
-        MeshError: There are no poses for the function, or it returned something that is not a body, or another
-            number of frames.
+        MeshError: There are no poses for the function, or it did not return a body with the right number of frames.
     """
     if body is None or isinstance(body, BodyMotion):
         return body

@@ -1,22 +1,22 @@
 """Reads pickles of plain data and executes nothing in them.
 
-A pickle is a program for a stack machine. Python's own machine imports what the file names and calls it: that is how
-a data file can run commands. The one here cannot, and this is why:
+A pickle is a program for a stack machine. Python's own machine imports the names in the file and calls them, so that a
+data file can run commands. The machine here cannot, for these reasons:
 
-- **It imports and looks up nothing.** A global in the file is a pair of words, compared with those of `KNOWN`; any
-  other is refused, with its name and place. What is put on the stack for a known one is an inert token.
+- **It imports and looks up nothing.** A global in the file is a pair of words, which is compared with those of `KNOWN`;
+  any other is refused, with its name and place. For a known global an inert token is put on the stack.
 - **It calls nothing that the file chose.** Of the opcodes that call, instantiate or set state, OBJ, INST, NEWOBJ,
   NEWOBJ_EX, EXT, PERSID and the out-of-band buffers are refused. REDUCE and BUILD lead to functions of
-  `unpickle_arrays`, picked by token, which check the type of every argument. What can be on the stack is None, bool,
-  int, float, str, bytes, list, tuple, dict, tokens and arrays of numbers: none has a method that a file has written.
+  `unpickle_arrays`, selected by token, which check the type of every argument. The stack can hold None, bool, int,
+  float, str, bytes, list, tuple, dict, tokens and arrays of numbers: none has a method that comes from a file.
 - **Arrays hold numbers or text of fixed width.** The type is matched with a pattern before NumPy sees it. Arrays of
   Python objects, which would be pickles of their own, records and subclasses are refused.
-- **It cannot be kept busy for ever or made to fill memory.** There are no jumps; opcodes are counted; each operand is
-  a piece of the file; bytes decoded or laid out as arrays count against a budget of a few times the file's size, so
-  that naming one piece a thousand times helps nobody; shapes must account for every byte; integers are short; nothing
-  here recurses, and keys of dictionaries are scalars, so a nest of containers is never walked, compared or hashed.
+- **It cannot run for ever or fill memory.** There are no jumps; opcodes are counted; each operand is a piece of the
+  file; bytes that are decoded or become arrays count against a budget of a few times the file's size, so that naming
+  one piece a thousand times gains nothing; shapes must account for every byte; integers are short; nothing here
+  recurses, and keys of dictionaries are scalars, so nested containers are never walked, compared or hashed.
 
-Opcodes are taken apart by `pickletools.genops` of the standard library, which parses operands and does nothing else.
+Opcodes are parsed by `pickletools.genops` of the standard library, which does nothing else.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from warpgarment.errors import MeshError
 
 from .unpickle_arrays import ArrayMaker, NdarrayToken, PendingDtype, Refusal
 
-LARGEST = 4 << 30  # bytes of a file
+LARGEST = 4 << 30  # largest file [bytes]
 OPCODES = 5_000_000
-SHARE, SPARE = 4, 1 << 20  # bytes that may be laid out, as a multiple of the file's, and on top
-BITS = 128  # of an integer
+SHARE, SPARE = 4, 1 << 20  # budget of bytes for arrays and text: multiple of the file's size, and constant part
+BITS = 128  # largest length of an integer
 
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 OPERANDS = {
@@ -48,11 +48,11 @@ KEYS = (str, bytes, int, float, np.generic, type(None))
 
 
 class PickleRefused(MeshError):
-    """A pickle that is damaged, or holds something besides plain data. Nothing in it was executed."""
+    """A pickle that is damaged or holds something other than plain data. Nothing in it was executed."""
 
 
 class Token:
-    """A function that a pickle may name. It cannot be called; REDUCE looks at which one it is."""
+    """A function that a pickle may name. It cannot be called; REDUCE compares tokens by identity."""
 
 
 RECONSTRUCT, SCALAR, FROMBUFFER, DTYPE, ENCODE, NO_BYTES, ORDERED_DICT = (Token() for _ in range(7))
@@ -66,7 +66,7 @@ KNOWN: dict[tuple[str, str], Token | NdarrayToken] = {
     ("numpy.core.numeric", "_frombuffer"): FROMBUFFER,
     ("numpy._core.numeric", "_frombuffer"): FROMBUFFER,
     ("_codecs", "encode"): ENCODE,
-    ("__builtin__", "bytes"): NO_BYTES,  # without arguments: how protocols below 3 write b""
+    ("__builtin__", "bytes"): NO_BYTES,  # called without arguments, it is b"" of protocols below 3
     ("collections", "OrderedDict"): ORDERED_DICT,
 }
 
@@ -75,7 +75,7 @@ def read_pickle(path: str | Path) -> Any:
     """The plain data of a pickle: dictionaries, lists, tuples, text, numbers, and NumPy arrays of numbers or text.
 
     Raises:
-        PickleRefused: The file holds anything else (the message says what and at which byte), or is damaged.
+        PickleRefused: The file holds anything else (the message names it and its byte), or is damaged.
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
@@ -105,7 +105,7 @@ def read_pickle(path: str | Path) -> Any:
 
 
 class _Machine:
-    """The stack, the memo, and what each opcode does to them."""
+    """The stack, the memo, and the effect of each opcode on them."""
 
     def __init__(self, budget: int):
         self.stack: list[Any] = []
@@ -127,13 +127,13 @@ class _Machine:
             raise Refusal(f"the opcode {name}")
 
     def result(self) -> Any:
-        """What is left at the end."""
+        """The one object that is left at the end."""
         if len(self.stack) != 1 or self.marks:
             raise ValueError(f"{len(self.stack)} objects are left at the end")
         return self.stack[0]
 
     def take(self, count: int) -> list[Any]:
-        """The topmost objects, taken off."""
+        """Removes and returns the topmost objects."""
         if len(self.stack) < count:
             raise IndexError("the stack is empty")
         items = self.stack[len(self.stack) - count :]
@@ -141,7 +141,7 @@ class _Machine:
         return items
 
     def take_marked(self) -> list[Any]:
-        """What lies above the last mark, taken off."""
+        """Removes and returns the objects above the last mark."""
         mark = self.marks.pop()
         return self.take(max(len(self.stack) - mark, 0))
 

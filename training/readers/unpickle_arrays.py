@@ -1,4 +1,4 @@
-"""What `unpickle` makes of the few NumPy globals it knows: arrays of numbers and of fixed-width text, nothing else."""
+"""Functions for the few NumPy globals that `unpickle` knows: arrays of numbers and fixed-width text, nothing else."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DIMENSIONS = 8
 
 
 class Refusal(Exception):
-    """What is refused, as the start of a sentence."""
+    """An object that is refused; the message is the start of a sentence."""
 
 
 class PendingDtype:
@@ -22,11 +22,11 @@ class PendingDtype:
         self.code, self.order = code, "="
 
     def make(self) -> np.dtype:
-        """The finished dtype; both parts have been matched with what is allowed."""
+        """The finished dtype; both parts were matched with the allowed ones before."""
         return np.dtype(self.order + self.code)
 
     def set_state(self, version: Any, order: Any, *rest: Any) -> None:
-        """Takes the byte order from a dtype's state: version, order, subtype, names, fields, size, ..."""
+        """Reads the byte order from a dtype's state: version, order, subtype, names, fields, size, ..."""
         if order not in ("<", ">", "|", "=") or any(part is not None for part in rest[:3]):
             raise Refusal("a structured array type")
         self.order = order
@@ -37,23 +37,23 @@ class NdarrayToken:
 
 
 class ArrayMaker:
-    """Makes arrays out of pieces of the file, within a budget of bytes.
+    """Makes arrays from pieces of the file, within a budget of bytes.
 
     Args:
-        budget: Bytes that may be laid out in all.
+        budget: Limit of the bytes of all arrays and text together.
     """
 
     def __init__(self, budget: int):
         self.budget = budget
 
     def spend(self, size: int) -> None:
-        """Counts bytes that are about to be laid out."""
+        """Subtracts bytes from the budget before they are allocated; refuses if it is exceeded."""
         self.budget -= size
         if self.budget < 0:
             raise Refusal("data that unfolds to many times the size of the file")
 
     def encoded(self, text: Any, encoding: Any) -> bytes:
-        """`_codecs.encode`: how Python 3 writes bytes for protocols below 3."""
+        """`_codecs.encode`, by which Python 3 writes bytes for protocols below 3."""
         if not isinstance(text, str) or encoding != "latin1":
             raise Refusal("_codecs.encode of something that is not text in latin1")
         self.spend(len(text))
@@ -73,7 +73,7 @@ class ArrayMaker:
         return np.zeros(0, dtype=np.uint8)
 
     def fill(self, array: np.ndarray, version: Any, shape: Any, dtype: Any, fortran: Any, data: Any) -> None:
-        """The state of an array from `array`."""
+        """Sets the state of an array that `array` made."""
         if isinstance(data, list):
             raise Refusal("an array of Python objects")
         if isinstance(data, str):  # written by Python 2
@@ -83,7 +83,7 @@ class ArrayMaker:
         array.__setstate__(state)
 
     def buffer(self, data: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> np.ndarray:
-        """`_frombuffer`: how NumPy writes contiguous arrays for protocol 5; order "K" is "C" with its axes permuted."""
+        """`_frombuffer`, by which NumPy writes contiguous arrays in protocol 5; "K" is "C" with permuted axes."""
         kind, shape = self._layout(dtype, shape, data)
         if order not in ("C", "F", "K") or (order == "K") == (axes is None):
             raise Refusal("an array in an unknown order")
@@ -95,14 +95,14 @@ class ArrayMaker:
         return flat.reshape(shape).transpose(axes)
 
     def scalar(self, dtype: Any, data: Any) -> np.generic:
-        """`scalar`."""
+        """`scalar`, a number of a NumPy type."""
         if isinstance(data, str):
             data = self.encoded(data, "latin1")
         kind, _ = self._layout(dtype, (1,), data)
         return np.frombuffer(data, dtype=kind)[0]
 
     def _layout(self, dtype: Any, shape: Any, data: Any) -> tuple[np.dtype, tuple[int, ...]]:
-        """Type and shape, which must account for every byte."""
+        """Type and shape of an array, which must account for every byte of its data."""
         if not isinstance(dtype, PendingDtype) or not isinstance(data, bytes):
             raise Refusal("an array without a plain type and bytes")
         shape = (shape,) if type(shape) is int else shape

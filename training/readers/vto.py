@@ -7,14 +7,15 @@ A sequence is a pickle, named as in ``tshirt_shape00_01_01.pkl``, of a dictionar
   calls them `poses` [T, 75] and `shapes` [T, 10], which is understood too, the last three taken for the translation;
 - `sequence`, `subject`, and `conf`, the simulator's configuration.
 
-SMPL's own convention for the translation. The file does not say the gender; others read it as female, and so does
-this.
+The translation follows SMPL's own convention. The file does not contain the gender; other readers take it to be female,
+and so does this one.
 
-A pickle can run commands when it is opened in the usual way. It is not opened in that way here: see `unpickle`, which
-reads arrays of numbers and refuses everything else. `convert_vto` writes what it found as .npz, once and for all.
+A pickle can run commands when it is opened in the usual way. It is not opened in that way here: `unpickle` reads arrays
+of numbers and refuses everything else. `convert_vto` writes the data as .npz, so that the pickle is read only once.
 
-The file has no rest shape. Without `rest=` the first frame serves, which lies on the body already: how much the cloth
-is stretched there counts as none. The authors' other repositories hold the garment's mesh (``tshirt.obj``).
+The file has no rest shape. Without `rest=` the first frame takes its place, in which the garment is already on the
+body: its stretch in that frame counts as none. The authors' other repositories hold the garment's mesh
+(``tshirt.obj``).
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ def read_vto(
     """Reads a sequence, as published or as `convert_vto` wrote it. Nothing in it is executed.
 
     Args:
-        path: The .pkl or .npz.
-        body: The body's motion, or a function that makes it of the sequence's SMPL poses; see `smpl.body_from`.
-        rest: A mesh file with the garment's rest shape [m], its vertices in the same order.
-        clean: Repair a rest mesh that a garment cannot have; the frames follow.
+        path: File to read, .pkl or .npz.
+        body: Motion of the body, or a function that makes it from the sequence's SMPL poses; see `smpl.body_from`.
+        rest: Mesh file with the garment's rest shape [m], with its vertices in the order of the sequence.
+        clean: Whether a rest mesh that is not valid for a garment is repaired; the frames follow.
 
     Raises:
-        PickleRefused: The pickle holds something besides plain data, or is damaged.
+        PickleRefused: The pickle holds something other than plain data, or is damaged.
         MeshError: Arrays are missing or do not fit each other.
 
     Warns:
@@ -95,15 +96,15 @@ def convert_vto(path: str | Path, output: str | Path, *, rest: str | Path | None
     """Writes a published sequence as .npz of plain arrays: `GarmentMotion.load` and `read_vto` read it.
 
     Args:
-        path: The .pkl.
-        output: The .npz; appears complete or not at all.
-        rest, clean: See `read_vto`.
+        path: Published file to read, .pkl.
+        output: File to write, .npz; it is written completely or not at all.
+        rest, clean: Rest shape and repair, as in `read_vto`.
 
     Returns:
-        The .npz.
+        Path of the .npz file.
 
     Raises:
-        PickleRefused, MeshError: See `read_vto`.
+        PickleRefused, MeshError: As in `read_vto`.
     """
     path, output = Path(path), Path(output)
     if output.suffix.lower() != ".npz":

@@ -32,21 +32,23 @@ def write_as_sequence(
     its vertices in every frame.
 
     Args:
-        recording: With a body: a network learns how cloth answers to it.
-        folder: The sequence's folder within the data set; must not exist. It appears complete or not at all.
+        recording: Recording with a body, since a network learns how cloth reacts to the body.
+        folder: Folder of the sequence within the data set, which must not exist. It is written completely or not at
+            all.
         split: "train", "validation" or "test".
-        collider: Faces of the body that cloth collides with, bool [G]; None: all. Hands and forearms pinch cloth.
-        name: Of the garment in tables; by default the garments' names.
-        motion: Name of the motion, by which `dataset verify` finds clips both trained and tested on; by default what
-            the data set calls it, or the source.
-        extra: More entries for the manifest.
+        collider: Mask of the body's faces with which cloth collides, bool [G]; None for all faces. Hands and forearms
+            pinch cloth and are better left out.
+        name: Name of the garment in tables; None for the garments' names.
+        motion: Name of the motion, by which `dataset verify` detects clips that are both trained and tested on; None
+            for its name in the data set, or the source.
+        extra: Additional entries of the manifest.
 
     Returns:
         The folder.
 
     Raises:
-        MeshError: No body, fewer than two frames, or a mask that does not fit.
-        ValueError: Another split.
+        MeshError: There is no body, there are fewer than two frames, or a mask does not fit.
+        ValueError: The split is not one of the three.
         FileExistsError: The folder exists.
     """
     if split not in SPLITS:

@@ -57,7 +57,7 @@ class Batch(NamedTuple):
     faces: torch.Tensor | None = None  # scalar, as `components`, of real faces; None where all are
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
-        """Samples, and operations of a training step on them (`flops.py`)."""
+        """Samples, and operations of a training step on them (`nn/flops.py`)."""
         samples, faces = self.features.shape[:2]
         return samples, work(config, [(samples, faces, self.velocities.shape[1], self.weights)])
 

@@ -1,6 +1,6 @@
 """Samples for unrolled training: whole garments on their bodies, K frames to go, as a `Scene` and its first state.
 
-A sample is a sequence and its newest history frame t, as in `samples.py`; the frames t+1..t+K are recorded answers. The
+A sample is a sequence and its newest history frame t, as in `single_step`; frames t+1..t+K are recorded answers. The
 history is displaced as there, and its features are computed from the displaced positions with cached nearest points.
 Everything stays in world space. Turns and mirrors are kept with the batch: the network sees turned and mirrored inputs.
 """
@@ -51,7 +51,7 @@ class UnrolledBatch:
     ids: list[tuple[str, int]]  # sequence, newest frame
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
-        """Samples, and operations of a training step on them (`flops.py`)."""
+        """Samples, and operations of a training step on them (`nn/flops.py`)."""
         views = [(*view.face_index.shape, view.component_index.shape[1], view.weights) for view in self.scene.views]
         return len(self.ids), len(self.recorded) * work(config, views)
 

@@ -2,7 +2,7 @@
 
     warpgarment evaluate --table table1 --data DATA --steps 20000       # manifold heads, singular values
     warpgarment evaluate --table table2 --data DATA --steps 20000       # power and radius of the geodesic attention
-    warpgarment evaluate --table recipe --data DATA --time-limit 60     # what each training setting is worth
+    warpgarment evaluate --table recipe --data DATA --time-limit 60     # the benefit of each training setting
     warpgarment evaluate --table figure5                                # time by stage
     warpgarment evaluate --table figure7 --data DATA                    # one garment at several resolutions
     warpgarment evaluate --table figure9 --data SEAMS                   # unseen seam cuts
@@ -10,7 +10,7 @@
     warpgarment evaluate --table category --data DATA                   # a garment category never seen
     warpgarment evaluate --table long --data DATA                       # rollouts of 1,000 frames
 
-All measure as `protocol.py` says and write JSON, Markdown and PNG, by default to benchmarks/results.
+All of them measure by the protocol of `protocol.py` and write JSON, Markdown and PNG, by default to benchmarks/results.
 """
 
 from __future__ import annotations
@@ -35,6 +35,6 @@ def make_table(config: Any) -> dict[str, Any]:
     """Makes the table that an `EvaluateConfig` names and writes it.
 
     Returns:
-        What its JSON file holds: `table`, `title`, `command`, `machine`, `rows`, and what each table adds.
+        The contents of its JSON file: `table`, `title`, `command`, `machine`, `rows`, and entries of the single table.
     """
     return importlib.import_module(f"{__name__}.{MAKERS[config.table]}").make(config)

@@ -1,5 +1,5 @@
-"""Tables 1 and 2 and that of the recipe: networks that differ in one setting, trained on one budget, measured on the
-same sequences."""
+"""Tables 1 and 2 and the table of the recipe: networks that differ in one setting, trained on one budget and measured
+on one set of sequences."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ PAPER = {
 
 
 def make(config: Any) -> dict[str, Any]:
-    """Trains what is not trained yet, measures every row, writes the table.
+    """Trains the rows that are not trained yet, measures every row and writes the table.
 
     Raises:
-        RunMismatch: A row's folder holds another run.
-        RowError, SettingError: Rows or settings that there are not.
-        OptionMissing, DataLacks: No budget, no data, no test sequences.
+        RunMismatch: The folder of a row holds another run.
+        RowError, SettingError: A row or setting does not exist.
+        OptionMissing, DataLacks: There is no budget, no data or no test sequence.
     """
     configs, chosen = plan(config)
     root, skipped = Path(config.data), dict[str, str]()
@@ -66,20 +66,20 @@ def make(config: Any) -> dict[str, Any]:
     for variant in (v for v in chosen if v.name in runs):
         run = runs[variant.name]
         simulator = Simulator(checkpoint.load(run.file), config.device)
-        baselines = config.baselines and not rows  # they are the same for all rows
-        found = measure(
+        baselines = config.baselines and not rows  # measured once, since they are the same for all rows
+        measured = measure(
             simulator, folders, frames=config.frames, geodesic_frames=config.geodesic_frames, baselines=baselines
         )
-        if not found.rows:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(found.skipped.items())[:3])
+        if not measured.rows:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(measured.skipped.items())[:3])
             raise DataLacks(f"{root}: no {config.split} sequence can be evaluated ({reasons})")
-        skipped |= found.skipped
-        mean = means(found.rows)
+        skipped |= measured.skipped
+        mean = means(measured.rows)
         own = {start: {"network": methods["network"]} for start, methods in mean.items()}
         rows.append(
             {"row": variant.name, "label": variant.label, "mean": own, "steps": run.steps, "hours": run.hours}
             | {"value": dict(variant.value), "overrides": variant.overrides, "settings": variant.settings}
-            | {"parameters": simulator.network.parameter_count(), "sequences": found.rows}
+            | {"parameters": simulator.network.parameter_count(), "sequences": measured.rows}
             | {"validation_cm": None if run.validation is None else round(run.validation, 2)}
         )
         if baselines:
@@ -102,7 +102,7 @@ def make(config: Any) -> dict[str, Any]:
 
 
 def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
-    """The training of each row, and the rows; nothing is trained here."""
+    """The training configuration of each row by name, and the rows; nothing is trained here."""
     options = config.tables
     if config.data is None:
         raise OptionMissing(f"{config.table} needs --data FOLDER")
@@ -112,7 +112,7 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
     if shape not in SHAPES:
         raise OptionMissing(f"{config.table} trains networks of its own; --network is their shape: {', '.join(SHAPES)}")
     common = _common(config, cast(Literal["small", "base", "fast"], shape))
-    variants.check_different({"all": common})  # says so if an override does not exist
+    variants.check_different({"all": common})  # raises an error if an override does not exist
     if config.table == "recipe":
         rows = recipe.recipe(common)
         rows = rows if options.rows else recipe.differing(rows, common)
@@ -125,7 +125,7 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
 
 
 def _common(config: Any, shape: Literal["small", "base", "fast"]) -> TrainConfig:
-    """The training that all rows start from."""
+    """The training configuration from which all rows start."""
     options = config.tables
     common = TrainConfig(
         data=Path(config.data),
@@ -142,7 +142,7 @@ def _common(config: Any, shape: Literal["small", "base", "fast"]) -> TrainConfig
 
 
 def _recipe(config: Any, rows: list[dict[str, Any]], configs: dict[str, TrainConfig]) -> list[str]:
-    """Adds to the rows what they change and what that did; the Markdown of them all."""
+    """Adds their change and its effect to the rows; returns the Markdown of all of them."""
     common = _common(config, next(iter(configs.values())).network)
     for row in rows:
         if row["row"] in configs:

@@ -1,4 +1,4 @@
-"""Figure 5: where the time of a frame goes, by stage and number of faces."""
+"""Figure 5: the time of a frame by stage and number of faces."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .pictures import axes_of, save
 from .report import grid, publish
 
 FRAMES = 30
-WARM_UP = 3  # frames that are not timed: kernels are compiled and chosen in them
+WARM_UP = 3  # number of frames that are not timed, in which kernels are compiled and chosen
 NOTE = (
     "The bundled dress, remeshed, on the bundled walk, one garment at a time; mean over the half of the frames that "
     "are neither fast nor slow. Rest: all that is in no stage. Set-up (geodesics, matrices) is once per garment."
@@ -45,7 +45,7 @@ def make(config: Any) -> dict[str, Any]:
 
 
 def timed(simulator: Simulator, faces: int, frames: int) -> dict[str, Any]:
-    """Milliseconds per stage and frame for the bundled dress with about so many faces."""
+    """Milliseconds per stage and frame for the bundled dress, remeshed to about a number of faces."""
     bundle = demo.assets()
     item = bundle.garments["dress"]
     new = remesh(item.garment, faces)

@@ -1,4 +1,4 @@
-"""Figure 7: one garment at several resolutions on one body motion; how far the rolled-out surfaces are apart."""
+"""Figure 7: one garment at several resolutions on one body motion, and the distances between the resulting surfaces."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ NOTE = (
 
 @dataclass
 class Surface:
-    """A rolled-out surface: vertices [T,V,3] of predicted frames, and faces; `start`: the newest known frame [V,3]."""
+    """A rolled-out surface: `vertices` of predicted frames [m], [T,V,3], `faces`, [F,3], and `start`, the newest known
+    frame [m], [V,3]."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -41,10 +42,10 @@ class Surface:
 
 
 def make(config: Any) -> dict[str, Any]:
-    """Rolls every resolution out, compares them, writes the figure.
+    """Rolls every resolution out, compares the results and writes the figure.
 
     Raises:
-        OptionMissing, DataLacks: No data, or no sequence whose garment can be remeshed.
+        OptionMissing, DataLacks: There are no data, or no sequence whose garment can be remeshed.
     """
     if config.data is None:
         raise OptionMissing("figure7 needs --data FOLDER")
@@ -58,13 +59,13 @@ def make(config: Any) -> dict[str, Any]:
         try:
             sequence = Sequence.load(folder)
             body = sequence.body()
-            found = {start: resolutions(simulator, sequence, body, config, start) for start in STARTS}
+            by_start = {start: resolutions(simulator, sequence, body, config, start) for start in STARTS}
         except (ValueError, OSError, KeyError, IndexError) as error:
             skipped[folder.name] = f"{type(error).__name__}: {error}"
             continue
         if config.picture and not rows:
-            _draw_surfaces(drawn, sequence, body, found["warm"], simulator.network.config.history)
-        for start, surfaces in found.items():
+            _draw_surfaces(drawn, sequence, body, by_start["warm"], simulator.network.config.history)
+        for start, surfaces in by_start.items():
             newest = simulator.network.config.history - 1 if start == "warm" else 0
             rows += compared(sequence, start, newest, surfaces)
     if not rows:
@@ -96,7 +97,7 @@ def resolutions(
     """Rollouts of a sequence's garment as recorded and at other resolutions.
 
     Returns:
-        "recorded mesh" and "N faces" -> surface.
+        Surfaces by the names "recorded mesh" and "N faces".
 
     Raises:
         NotRemeshable: The garment cannot be remeshed.
@@ -104,7 +105,7 @@ def resolutions(
     """
     newest = simulator.network.config.history - 1 if start == "warm" else 0
     steps = min(min(len(sequence.vertices), body.frames) - 1 - newest, config.frames or 2**31)
-    known = np.array(sequence.vertices[: newest + 1], np.float32)  # all that a rollout sees of the recording
+    known = np.array(sequence.vertices[: newest + 1], np.float32)  # the only recorded frames that a rollout reads
     if steps < 1 or not np.isfinite(known).all():
         raise ValueError(f"{len(sequence.vertices)} frames, too few, or the first are not finite")
     starts = {"recorded mesh": Known(sequence.garment, known)}
@@ -120,7 +121,7 @@ def resolutions(
 
 
 def compared(sequence: Sequence, start: str, newest: int, surfaces: dict[str, Surface]) -> list[dict[str, Any]]:
-    """A row for every resolution: distances from the reference, per frame, and from the recording."""
+    """A row for every resolution: distances from the reference in each frame [m], and from the recording [m]."""
     reference = surfaces["recorded mesh"]
     rows = []
     for name, surface in surfaces.items():
@@ -145,17 +146,17 @@ _DISTANCES = ("distance_m", "start_distance_m", "from_recording_m")
 
 
 def summarised(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over sequences, of those that stayed finite in all resolutions, so that all are over the same ones."""
+    """Means over the sequences that stayed finite in all resolutions, so that all means are comparable."""
     keys = {(row["start"], row["sequence"]) for row in rows}
     bad = {(r["start"], r["sequence"]) for r in rows if not np.isfinite([r[key] for key in _DISTANCES]).all()}
     summary = []
     for start in STARTS:
         for name in dict.fromkeys(row["row"] for row in rows):
-            mine = [r for r in rows if (r["start"], r["row"]) == (start, name)]
-            good = [r for r in mine if (start, r["sequence"]) in keys - bad]
+            of_row = [r for r in rows if (r["start"], r["row"]) == (start, name)]
+            good = [r for r in of_row if (start, r["sequence"]) in keys - bad]
             mean = {k: float(np.mean([r[k] for r in good])) if good else float("nan") for k in ("faces", *_DISTANCES)}
-            failed = sum(not np.isfinite(r["from_recording_m"]) for r in mine)
-            summary.append({"row": name, "start": start, **mean, "failed": failed, "sequences": len(mine)})
+            failed = sum(not np.isfinite(r["from_recording_m"]) for r in of_row)
+            summary.append({"row": name, "start": start, **mean, "failed": failed, "sequences": len(of_row)})
     return summary
 
 
@@ -164,7 +165,7 @@ def _between(vertices: np.ndarray, surface: Surface, others: np.ndarray, other: 
 
 
 def _draw_curves(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Distance from the reference over time: mean over the sequences that last so long."""
+    """Distance from the reference over time, as a mean over the sequences that are long enough."""
     figure, axes = axes_of(2, height=3.6, width=4.6, share_y=True)
     names = [name for name in dict.fromkeys(row["row"] for row in rows) if name != "recorded mesh"]
     for axis, start in zip(axes, STARTS, strict=True):

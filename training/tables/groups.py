@@ -1,4 +1,4 @@
-"""Figures 9 and 12 and the unseen category: one network, test sequences in groups that were seen in training or not."""
+"""Figures 9 and 12 and the unseen category: one network on groups of test sequences, seen in training or not."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ OTHERS = (
 
 @dataclass(frozen=True)
 class Group:
-    """Sequences that make a row.
+    """Sequences of one row.
 
     Attributes:
-        name: Of the row.
-        label: In the table.
-        seen: Whether training has seen what the table is about.
-        folders: Its sequences.
+        name: Name of the row.
+        label: Label of the row in the table.
+        seen: Whether training has seen the cuts, bodies or categories of the row.
+        folders: Folders of the sequences.
     """
 
     name: str
@@ -49,7 +49,7 @@ def make(config: Any) -> dict[str, Any]:
     """Measures the groups of a table and writes it.
 
     Raises:
-        OptionMissing: No data.
+        OptionMissing: There are no data.
         DataLacks: The data set does not have both sides of the comparison.
     """
     if config.data is None:
@@ -64,7 +64,7 @@ def make(config: Any) -> dict[str, Any]:
         simulator = Simulator(checkpoint.load(path), config.device)
         first = not rows
         folders = {folder: None for group in groups for folder in evenly(group.folders, config.max_sequences)}
-        found = measure(
+        measured = measure(
             simulator,
             list(folders),
             frames=config.frames,
@@ -72,17 +72,17 @@ def make(config: Any) -> dict[str, Any]:
             baselines=config.baselines and first,
             observe=keeper if first and config.picture else None,
         )
-        skipped |= found.skipped
+        skipped |= measured.skipped
         for group in groups:
             names = {folder.name for folder in evenly(group.folders, config.max_sequences)}
-            mine = [row for row in found.rows if row["sequence"] in names]
-            if not mine:
-                left_out[group.label] = "; ".join(f"{n}: {r}" for n, r in found.skipped.items() if n in names)
+            own = [row for row in measured.rows if row["sequence"] in names]
+            if not own:
+                left_out[group.label] = "; ".join(f"{n}: {r}" for n, r in measured.skipped.items() if n in names)
                 continue
             label = group.label + (f", {_label(path)}" if config.tables.against else "")
             rows.append(
-                {"row": group.name, "label": label, "seen": group.seen, "network": _label(path), "mean": means(mine)}
-                | {"count": len({row["sequence"] for row in mine}), "sequences": mine}
+                {"row": group.name, "label": label, "seen": group.seen, "network": _label(path), "mean": means(own)}
+                | {"count": len({row["sequence"] for row in own}), "sequences": own}
             )
     if {row["seen"] for row in rows} != {True, False}:
         reasons = "; ".join(f"{label}: {reason}" for label, reason in left_out.items())
@@ -104,18 +104,18 @@ def make(config: Any) -> dict[str, Any]:
 
 
 def cuts(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
-    """Figure 9: the cuts trained on, on training and on unseen motions, and cuts never seen."""
+    """Figure 9: cuts trained on, with training motions and with unseen motions, and cuts never seen."""
     manifests = _manifests(root, None, skipped)
     cut = {folder: n for folder, m in manifests.items() if (n := _cut(m)) is not None}
     trained = {n for folder, n in cut.items() if manifests[folder].get("split") == "train"}
 
-    def those(split: str, seen: bool) -> list[Path]:
+    def of_split(split: str, seen: bool) -> list[Path]:
         return [f for f, n in cut.items() if manifests[f].get("split") == split and (n in trained) == seen]
 
     groups = [
-        Group("unseen_cuts", "unseen cuts, unseen motions", False, those("test", False)),
-        Group("training_cuts", "cuts trained on, motions not trained on", True, those("validation", True)),
-        Group("training_sequences", "cuts and motions trained on", True, those("train", True)),
+        Group("unseen_cuts", "unseen cuts, unseen motions", False, of_split("test", False)),
+        Group("training_cuts", "cuts trained on, motions not trained on", True, of_split("validation", True)),
+        Group("training_sequences", "cuts and motions trained on", True, of_split("train", True)),
     ]
     if not groups[0].folders or not any(group.folders for group in groups[1:]):
         raise DataLacks(
@@ -126,7 +126,7 @@ def cuts(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
 
 
 def bodies(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
-    """Figure 12: bodies of kinds that no training sequence has, and those of kinds that some have."""
+    """Figure 12: bodies of kinds that no training sequence has, and bodies of kinds that some have."""
     manifests = _manifests(root, config.split, skipped)
     trained = {_kind(m) for m in _manifests(root, "train", skipped).values()}
     kinds = {folder: _kind(m) for folder, m in manifests.items()}
@@ -150,7 +150,7 @@ def bodies(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
 
 
 def categories(root: Path, config: Any, skipped: dict[str, str]) -> list[Group]:
-    """The unseen category: test sequences of categories held out, and of the others one by one and together."""
+    """The unseen category: test sequences of held-out categories, and of the others one by one and together."""
     held_out = tuple(config.tables.held_out) or _held_out(root)
     manifests = _manifests(root, config.split, skipped)
     kinds = {folder: str(m.get("category")) for folder, m in manifests.items()}
@@ -192,12 +192,12 @@ def _kind(manifest: dict[str, Any]) -> str:
 
 
 def _held_out(root: Path) -> tuple[str, ...]:
-    found = read_set_manifest(root) or {}
-    return tuple(map(str, (found.get("configuration") or {}).get("held_out") or ()))
+    manifest = read_set_manifest(root) or {}
+    return tuple(map(str, (manifest.get("configuration") or {}).get("held_out") or ()))
 
 
 def _label(path: Path) -> str:
-    """A run's folder where the file is called as all runs call theirs."""
+    """Name of the run's folder if the file has the name that all runs use, otherwise the name of the file."""
     return path.parent.name if path.stem in ("best", "network") else path.stem
 
 

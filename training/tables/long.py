@@ -1,4 +1,4 @@
-"""Long rollouts, 1,000 frames by default: does anything drift, grow or sink in?"""
+"""Long rollouts, 1,000 frames by default, which show whether garments drift, grow or sink into the body."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .pictures import axes_of, save
 from .protocol import STARTS, Known, evenly
 from .report import grid, publish
 
-SEQUENCES = 3  # of a data set, unless max_sequences says otherwise
+SEQUENCES = 3  # number of sequences of a data set, unless max_sequences is given
 HEADINGS = {  # limit -> heading, unit factor, format
     "mean_m": ("mean off [cm]", 100.0, "{:.1f}"),
     "energy_growth": ("energy growth", 1.0, "{:.2f}"),
@@ -42,10 +42,10 @@ NOTE = (
 
 
 def make(config: Any) -> dict[str, Any]:
-    """Rolls out, measures, judges and writes.
+    """Rolls out, measures, judges and writes the table.
 
     Raises:
-        OptionMissing: Neither a garment to walk nor data.
+        OptionMissing: There is neither a garment for a walk nor data.
         DataLacks: No sequence of the data set can be rolled out.
     """
     options = config.tables
@@ -61,17 +61,17 @@ def make(config: Any) -> dict[str, Any]:
     skipped: dict[str, str] = {}
     if config.data is not None:
         folders = folders_of(Path(config.data), config.split, skipped)
-        found = []
+        measured = []
         for folder in tqdm(evenly(folders, config.max_sequences or SEQUENCES), desc="sequences"):
             try:
                 sequence = Sequence.load(folder)
-                found += [forth_and_back(simulator, sequence, start, options.long_frames) for start in STARTS]
+                measured += [forth_and_back(simulator, sequence, start, options.long_frames) for start in STARTS]
             except (ValueError, OSError, KeyError, IndexError) as error:
                 skipped[folder.name] = f"{type(error).__name__}: {error}"
-        if not found:
+        if not measured:
             reasons = "; ".join(f"{n}: {r}" for n, r in skipped.items()) or "none found"
             raise DataLacks(f"{config.data}: no {config.split} sequence can be rolled out ({reasons})")
-        rows += found
+        rows += measured
     result: dict[str, Any] = {"table": "long", "title": f"Rollouts of {options.long_frames:,} frames", "protocol": NOTE}
     result |= {"network": path.name, "limits": vars(Limits()), "rows": rows, "skipped": skipped}
     headings = ["", "start", *(heading for heading, _, _ in HEADINGS.values()), "mean from the body [cm]", "verdict"]
@@ -82,19 +82,19 @@ def make(config: Any) -> dict[str, Any]:
 
 
 def walked(simulator: Simulator, name: str, frames: int) -> dict[str, Any]:
-    """A bundled garment on a procedural walk, from a cold start."""
+    """The row of a bundled garment on a procedural walk, from a cold start."""
     garment = demo.assets().garments[name].garment
     body, place = walk(frames + 1)
     first = (garment.vertices @ place[:, :3].T + place[:, 3]).astype(np.float32)
     vertices = predict(simulator, Known(garment, first[None]), 0, frames, cold=True, body=body)
-    found = figures(garment, vertices, first, body, 1)
-    return _row(f"walk, {name}", "cold", found)
+    curves = figures(garment, vertices, first, body, 1)
+    return _row(f"walk, {name}", "cold", curves)
 
 
 def forth_and_back(simulator: Simulator, sequence: Sequence, start: str, frames: int) -> dict[str, Any]:
-    """A recorded sequence, its motion played forth and back."""
+    """The row of a recorded sequence whose motion is played forth and back."""
     newest = simulator.network.config.history - 1 if start == "warm" else 0
-    known = np.array(sequence.vertices[: newest + 1], np.float32)  # all that the rollout sees of the recording
+    known = np.array(sequence.vertices[: newest + 1], np.float32)  # the only recorded frames that the rollout reads
     recorded = sequence.body()
     if len(known) <= newest or not np.isfinite(known).all():
         raise ValueError(f"{len(known)} recorded frames, or they are not finite; a {start} start needs {newest + 1}")
@@ -104,21 +104,21 @@ def forth_and_back(simulator: Simulator, sequence: Sequence, start: str, frames:
     shown = forward & (times < len(sequence.vertices))
     share = vertex_areas(sequence.garment)
     mean[shown] = np.einsum("v,tvc->tc", share, np.asarray(sequence.vertices)[times[shown].astype(int)])
-    found = figures(sequence.garment, vertices, known[-1], body, newest + 1, mean[newest + 1 :])
-    return _row(sequence.name, start, found)
+    curves = figures(sequence.garment, vertices, known[-1], body, newest + 1, mean[newest + 1 :])
+    return _row(sequence.name, start, curves)
 
 
-def _row(name: str, start: str, found: dict[str, np.ndarray]) -> dict[str, Any]:
-    verdict = judged(found)
-    finite = int(np.isfinite(found["energy"]).sum())
+def _row(name: str, start: str, curves: dict[str, np.ndarray]) -> dict[str, Any]:
+    verdict = judged(curves)
+    finite = int(np.isfinite(curves["energy"]).sum())
     return {
         "row": name,
         "start": start,
         "finite_frames": finite,
         "verdict": verdict,
         "good": all(v["kept"] for v in verdict.values()),
-        "largest_mean_to_anchor_m": float(np.max(found["mean_to_anchor_m"])),
-        "curves": {key: [round(float(v), 6) for v in values] for key, values in found.items()},
+        "largest_mean_to_anchor_m": float(np.max(curves["mean_to_anchor_m"])),
+        "curves": {key: [round(float(v), 6) for v in values] for key, values in curves.items()},
     }
 
 
@@ -130,7 +130,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _draw(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Every figure over time, a line per rollout, and its limit."""
+    """Every figure over time with its limit, one line per rollout."""
     panels = (
         ("mean_drift_m", "mean, drift on the body [cm]", 100.0, "mean_m"),
         ("mean_to_recording_m", "mean from the recording [cm]", 100.0, "mean_m"),
@@ -143,10 +143,10 @@ def _draw(path: Path, rows: list[dict[str, Any]]) -> None:
     palette = (draw.CORAL, draw.TEAL, draw.OCHRE, draw.PLUM, draw.SLATE)
     names = list(dict.fromkeys(row["row"] for row in rows))
     for axis, (key, text, scale, limit) in zip(axes, panels, strict=True):
-        top = 0.0  # of the energy: a garment that settles on a body at rest would flatten all that follows
+        top = 0.0  # top of the energy's axis: a garment that settles on a body at rest would flatten all later values
         for row in rows:
             values = np.array(row["curves"][key], np.float64)
-            if key == "energy":  # over a second, so that a line is seen
+            if key == "energy":  # mean over a second, so that the line is legible
                 values, below = (_running(np.array(row["curves"][k])) for k in ("energy", "body_energy"))
                 values = (values + STILL) / (below + STILL)
                 top = max(top, 1.2 * np.nanmax(values[settled(len(values))], initial=0.0))

@@ -5,11 +5,11 @@ frames with constant acceleration,
 
     s(tau) = L - w/2 + tau - tau^2 / 2w        0 <= tau <= 2w        L the last frame
 
-so the speed is continuous (and, w being even, forward passes show whole recorded frames again, where the recorded
-garment can be compared with). Between recorded frames body vertices follow a cubic spline.
+so the speed is continuous (and, since w is even, forward passes show whole recorded frames again, in which the recorded
+garment can be compared). Between recorded frames body vertices follow a cubic spline.
 
-The anchor of a garment is the body beneath it: the body vertices nearest to its pins, or to all of it where nothing is
-pinned. A garment that keeps its place has its mean where the rigid motion of the anchor (Kabsch) takes it, once it has
+The anchor of a garment is the body beneath it: the body vertices nearest to its pins, or to the whole garment if it has
+no pins. The mean of a garment that keeps its place follows the rigid motion of the anchor (Kabsch) once the garment has
 settled: recorded dresses, too, sink by some centimetres when they start to move.
 """
 
@@ -28,22 +28,22 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.training.rollouts import kabsch
 
-TURN = 12  # w: frames that slowing down takes
-SETTLING = 60  # frames after the start that a garment may take to find its place and speed
-STILL = 0.5 * 0.02**2  # J/kg, energy below which nothing moves: 2 cm/s
+TURN = 12  # w: number of frames in which the motion slows down
+SETTLING = 60  # number of frames after the start in which a garment may settle to its place and speed
+STILL = 0.5 * 0.02**2  # energy below which a garment counts as still [J/kg], that of 2 cm/s
 _COLUMNS = 6000  # coordinates interpolated at once
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a good long rollout keeps.
+    """Limits of a good long rollout.
 
     Attributes:
-        mean_m: Distance of the garment's mean from where the recording has it, or the anchor takes it from where it
-            settled [m].
+        mean_m: Distance of the garment's mean from its place in the recording, or from the place to which the anchor
+            moves it after settling [m].
         energy_growth: Kinetic energy relative to the body's, last third of the frames over the first third.
-        stretch: Of the longest edge relative to its rest length: 1 is twice as long.
-        penetration_m: Deepest vertex of all frames [m].
+        stretch: Extension of the longest edge as a share of its rest length; 1 means twice as long.
+        penetration_m: Depth of the deepest vertex of all frames [m].
         inside: Mean share of vertices inside the body.
     """
 
@@ -58,22 +58,22 @@ def there_and_back(frames: int, total: int, turn: int = TURN) -> tuple[np.ndarra
     """Times of a recording of `frames` frames, played forth and back for `total` frames.
 
     Args:
-        frames: Of the recording.
-        total: Wanted.
-        turn: w, even; less where the recording is short.
+        frames: Number of frames of the recording.
+        total: Wanted number of frames.
+        turn: Number of frames w in which the motion slows down, even; a short recording gets fewer.
 
     Returns:
-        Times [frames], float64 [total], starting at 0 with full speed; and where a whole frame is shown at full
-        speed forward, bool [total].
+        Times in frames of the recording, float64 [total], starting at 0 with full speed; whether a whole frame is shown
+        forward at full speed, bool [total].
 
     Raises:
-        ValueError: Fewer than 4 frames.
+        ValueError: The recording has fewer than 4 frames.
     """
     last = frames - 1
     if last < 3:
         raise ValueError(f"{frames} frames are too few to play forth and back")
     w = max(2, min(turn, last // 2) // 2 * 2)
-    even = last - w  # frames at full speed
+    even = last - w  # number of frames at full speed
     t = np.arange(total, dtype=np.float64)
     phase = (t - w / 2) % (2 * even + 4 * w)
     tau = phase - even
@@ -90,7 +90,7 @@ def there_and_back(frames: int, total: int, turn: int = TURN) -> tuple[np.ndarra
 
 
 def extended(body: BodyMotion, total: int, turn: int = TURN) -> tuple[BodyMotion, np.ndarray, np.ndarray]:
-    """A motion played forth and back; returns it with what `there_and_back` gives."""
+    """A motion played forth and back for `total` frames; returns it with the two results of `there_and_back`."""
     times, forward = there_and_back(body.frames, total, turn)
     recorded = np.asarray(body.vertices).reshape(body.frames, -1)
     vertices = np.empty((total, recorded.shape[1]), np.float32)
@@ -98,16 +98,20 @@ def extended(body: BodyMotion, total: int, turn: int = TURN) -> tuple[BodyMotion
         part = slice(first, first + _COLUMNS)
         vertices[:, part] = CubicSpline(np.arange(body.frames), recorded[:, part].astype(np.float64))(times)
     whole = times == np.round(times)
-    vertices[whole] = recorded[times[whole].astype(int)]  # exactly what was recorded
+    vertices[whole] = recorded[times[whole].astype(int)]  # exactly as recorded
     return BodyMotion(vertices.reshape(total, -1, 3), body.faces, body.fps), times, forward
 
 
 def walk(frames: int, seed: int = 0) -> tuple[BodyMotion, np.ndarray]:
     """The bundled body, from its rest pose into a procedural walk.
 
+    Args:
+        frames: Number of frames.
+        seed: Seed of the walk.
+
     Returns:
-        What garments collide with, and the rigid transform [3,4] that takes a garment made for the rest pose to the
-        first frame.
+        The part of the body with which garments collide, and the rigid transform [3,4], in metres, that moves a garment
+        made for the rest pose to the first frame.
     """
     from warpgarment.training.bodies.anny import bundled_body
     from warpgarment.training.bodies.skeleton import arms_abducted, blended_in, facing_forward, posed
@@ -122,13 +126,13 @@ def walk(frames: int, seed: int = 0) -> tuple[BodyMotion, np.ndarray]:
 
 
 class Anchor:
-    """The part of a body that a garment goes with.
+    """The part of a body that a garment moves with.
 
     Args:
-        garment: With its pins.
-        vertices: Where it is in `frame` [m], shape [V,3].
-        body: Its motion.
-        frame: Of the body.
+        garment: Garment with its pins.
+        vertices: Vertices of the garment in frame `frame` [m], shape [V,3].
+        body: Motion of the body.
+        frame: Index of a frame of the body.
     """
 
     def __init__(self, garment: Garment, vertices: np.ndarray, body: BodyMotion, frame: int) -> None:
@@ -141,7 +145,15 @@ class Anchor:
         self.tied = np.unique(tree.query(place[garment.pins])[1]) if len(garment.pins) > 2 else self.beneath
 
     def place(self, mean: np.ndarray, body_vertices: np.ndarray) -> np.ndarray:
-        """Where a garment's mean [3] is as seen from the anchor: where it would be in the anchor's first frame [m]."""
+        """A garment's mean, moved with the anchor back to the anchor's first frame.
+
+        Args:
+            mean: Mean of the garment's vertices [m], shape [3].
+            body_vertices: Vertices of the body in that frame [m], shape [U,3].
+
+        Returns:
+            Position in the anchor's first frame [m], shape [3].
+        """
         now = np.asarray(body_vertices, np.float64)
         rotation, translation = kabsch(self.start[self.tied], now[self.tied])
         return rotation.T @ (mean - translation)
@@ -155,27 +167,27 @@ def figures(
     first: int,
     recorded_mean: np.ndarray | None = None,
 ) -> dict[str, np.ndarray]:
-    """Figures of every frame of a rollout; NaN from where it is not finite.
+    """Figures of every frame of a rollout; NaN from the first frame that is not finite.
 
     Args:
-        garment: At rest.
+        garment: Garment at rest.
         vertices: Predicted positions [m], shape [T,V,3].
-        before: The newest known frame, [V,3].
-        body: Its motion; frame `first` is that of vertices[0].
-        first: See `body`; at least 1.
-        recorded_mean: Where the recorded garment's mean was [m], [T,3]; NaN where that is not known.
+        before: Positions in the newest known frame [m], shape [V,3].
+        body: Motion of the body; its frame `first` is that of vertices[0].
+        first: Index of that frame of the body, at least 1.
+        recorded_mean: Mean of the recorded garment in every frame [m], [T,3]; NaN where it is not known.
 
     Returns:
-        float64 [T]: `mean_to_anchor_m`; `mean_drift_m`, the same from where the mean settled (its average over the
-        first third of the frames, without the first two seconds); `mean_to_recording_m`; `energy` and `body_energy`
-        [J/kg] in the frame that travels with the body beneath; `stretch` (longest edge over rest length, less one);
-        `penetration_m`; `inside`.
+        Curves by name, float64 [T] each: `mean_to_anchor_m`; `mean_drift_m`, the distance from the place at which the
+        mean settled (its average over the first third of the frames, without the first two seconds);
+        `mean_to_recording_m`; `energy` and `body_energy` [J/kg] in coordinates that travel with the body beneath;
+        `stretch` (longest edge over rest length, less one); `penetration_m`; `inside`.
     """
     anchor = Anchor(garment, before, body, first - 1)
     i, j = garment.edges.T
     rest = np.linalg.norm(garment.vertices[i].astype(np.float64) - garment.vertices[j], axis=1)
     meshes = BodyMeshes(torch.from_numpy(np.array(body.vertices[first])), torch.from_numpy(np.array(body.faces)))
-    found = {name: np.full(len(vertices), np.nan) for name in FIGURES}
+    curves = {name: np.full(len(vertices), np.nan) for name in FIGURES}
     previous, places = np.asarray(before, np.float64), np.full((len(vertices), 3), np.nan)
     for t, positions in enumerate(vertices):
         if not np.isfinite(positions).all():
@@ -187,18 +199,18 @@ def figures(
         mean = anchor.share @ now
         places[t] = anchor.place(mean, body_now)
         if recorded_mean is not None:
-            found["mean_to_recording_m"][t] = np.linalg.norm(mean - recorded_mean[t])
-        found["energy"][t] = 0.5 * anchor.share @ (velocity**2).sum(axis=1)
-        found["body_energy"][t] = 0.5 * ((body_velocity - travel) ** 2).sum(axis=1).mean()
-        found["stretch"][t] = (np.linalg.norm(now[i] - now[j], axis=1) / rest).max() - 1.0
+            curves["mean_to_recording_m"][t] = np.linalg.norm(mean - recorded_mean[t])
+        curves["energy"][t] = 0.5 * anchor.share @ (velocity**2).sum(axis=1)
+        curves["body_energy"][t] = 0.5 * ((body_velocity - travel) ** 2).sum(axis=1).mean()
+        curves["stretch"][t] = (np.linalg.norm(now[i] - now[j], axis=1) / rest).max() - 1.0
         meshes.update(torch.from_numpy(np.array(body.vertices[first + t])))
         distance = meshes.query(torch.from_numpy(np.ascontiguousarray(positions, np.float32))).distance.numpy()
-        found["penetration_m"][t] = max(0.0, -float(distance.min()))
-        found["inside"][t] = (distance < 0).mean()
+        curves["penetration_m"][t] = max(0.0, -float(distance.min()))
+        curves["inside"][t] = (distance < 0).mean()
         previous = now
-    found["mean_to_anchor_m"] = np.linalg.norm(places - anchor.mean, axis=1)
-    found["mean_drift_m"] = np.linalg.norm(places - np.array_split(places[settled(len(places))], 3)[0].mean(0), axis=1)
-    return found
+    curves["mean_to_anchor_m"] = np.linalg.norm(places - anchor.mean, axis=1)
+    curves["mean_drift_m"] = np.linalg.norm(places - np.array_split(places[settled(len(places))], 3)[0].mean(0), axis=1)
+    return curves
 
 
 FIGURES = (
@@ -208,37 +220,37 @@ FIGURES = (
 
 
 def settled(frames: int) -> slice:
-    """Frames of a rollout of so many that are not part of its start; all of a short one."""
+    """The frames of a rollout that are not part of its start; all frames of a short one."""
     return slice(SETTLING if frames > 3 * SETTLING else 0, None)
 
 
-def energy_growth(found: dict[str, np.ndarray]) -> float:
+def energy_growth(curves: dict[str, np.ndarray]) -> float:
     """Kinetic energy relative to the body's in the last third of the frames over that in the first third.
 
-    The first two seconds are left out where there is more: a start is not at the speed of the rest.
+    The first two seconds of a longer rollout are left out, since its start has another speed.
     """
-    counted = settled(len(found["energy"]))
-    thirds = [np.array_split(found[name][counted] + STILL, 3) for name in ("energy", "body_energy")]
+    counted = settled(len(curves["energy"]))
+    thirds = [np.array_split(curves[name][counted] + STILL, 3) for name in ("energy", "body_energy")]
     first, last = (thirds[0][k].sum() / thirds[1][k].sum() for k in (0, -1))
     return float(last / first)
 
 
-def judged(found: dict[str, np.ndarray], limits: Limits | None = None) -> dict[str, dict[str, float | bool]]:
-    """The verdict: for each limit the value, the limit, and whether it is kept. NaN keeps nothing.
+def judged(curves: dict[str, np.ndarray], limits: Limits | None = None) -> dict[str, dict[str, float | bool]]:
+    """The verdict: for each limit the value, the limit, and whether it is kept. NaN keeps no limit.
 
-    The mean is compared with the recording where that is known in any frame, else with the anchor, after settling.
+    The mean is compared with the recording if that is known in any frame, otherwise with the anchor, after settling.
     """
     limits = limits or Limits()
-    with_recording = np.isfinite(found["mean_to_recording_m"]).any()
-    drift = found["mean_drift_m"][settled(len(found["mean_drift_m"]))]
-    distance = found["mean_to_recording_m"] if with_recording else drift
-    finite = bool(np.isfinite(found["energy"]).all())
+    with_recording = np.isfinite(curves["mean_to_recording_m"]).any()
+    drift = curves["mean_drift_m"][settled(len(curves["mean_drift_m"]))]
+    distance = curves["mean_to_recording_m"] if with_recording else drift
+    finite = bool(np.isfinite(curves["energy"]).all())
     values = {
         "mean_m": np.nanmax(distance) if finite else np.nan,
-        "energy_growth": energy_growth(found),
-        "stretch": found["stretch"].max(),
-        "penetration_m": found["penetration_m"].max(),
-        "inside": found["inside"].mean(),
+        "energy_growth": energy_growth(curves),
+        "stretch": curves["stretch"].max(),
+        "penetration_m": curves["penetration_m"].max(),
+        "inside": curves["inside"].mean(),
     }
     return {
         name: {"value": float(value), "limit": getattr(limits, name), "kept": bool(value <= getattr(limits, name))}
@@ -247,7 +259,7 @@ def judged(found: dict[str, np.ndarray], limits: Limits | None = None) -> dict[s
 
 
 def vertex_areas(garment: Garment) -> np.ndarray:
-    """Share of each vertex in the area at rest, which is its share of the mass; [V], sums to one."""
+    """Share of each vertex in the area at rest, which is its share of the mass; [V], with sum one."""
     area = np.asarray(igl.doublearea(garment.vertices.astype(np.float64), garment.faces.astype(np.int64)))
     share = np.bincount(garment.faces.ravel(), np.repeat(area, 3), minlength=len(garment.vertices))
     return share / share.sum()

@@ -1,7 +1,7 @@
-"""A garment with another number of faces, and how it follows the one it was made from.
+"""A garment with another number of faces, and its positions from those of the original garment.
 
-The garment is remeshed at rest. Each new vertex keeps its barycentric coordinates on the old triangle that it lies on,
-which carries it wherever the old mesh is known: in the first frames of a recording.
+The garment is remeshed at rest. Each new vertex keeps its barycentric coordinates on the old triangle below it, which
+carries it in all frames in which the old mesh is known: the first frames of a recording.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from warpgarment.training.meshes.cutting import remeshed
 
 
 class NotRemeshable(ValueError):
-    """A garment that cannot be compared over resolutions; says why."""
+    """A garment that cannot be compared over resolutions; the message has the reason."""
 
 
 @dataclass(frozen=True)
 class Remeshed:
-    """A garment and where its vertices lie on another.
+    """A remeshed garment, and the places of its vertices on the original one.
 
     Attributes:
-        garment: With about as many faces as were asked for.
-        corners: Vertices of the old triangle, int [V,3].
-        weights: Barycentric coordinates on it, [V,3].
+        garment: Garment with about the wanted number of faces.
+        corners: Vertices of the old triangle that holds each new vertex, int [V,3].
+        weights: Barycentric coordinates of the new vertex on it, [V,3].
     """
 
     garment: Garment
@@ -34,20 +34,20 @@ class Remeshed:
     weights: np.ndarray
 
     def carried(self, vertices: np.ndarray) -> np.ndarray:
-        """Positions of the old mesh, [T,V,3] or [V,3] in metres, to those of the new one, float32."""
+        """Positions of the new mesh from those of the old one, both [m], [T,V,3] or [V,3]; float32."""
         corners = np.asarray(vertices, np.float64)[..., self.corners, :]
         return np.einsum("vk,...vkc->...vc", self.weights, corners).astype(np.float32)
 
 
 def remesh(garment: Garment, faces: int) -> Remeshed:
-    """Remeshes a garment isotropically; pins go to where most of the weight is on pins.
+    """Remeshes a garment isotropically; vertices with most of their weight on old pins become pins.
 
     Args:
-        garment: One connected sheet.
-        faces: Number aimed at.
+        garment: Garment of one connected sheet.
+        faces: Wanted number of faces.
 
     Raises:
-        NotRemeshable: Several pieces, or cuts whose sides lie on each other at rest.
+        NotRemeshable: The garment has several pieces, or cuts whose sides lie on each other at rest.
         MissingExtra: gpytoolbox is not installed.
     """
     if garment.components[2] > 1:
@@ -76,10 +76,10 @@ def surface_distance(a: np.ndarray, faces_a: np.ndarray, b: np.ndarray, faces_b:
 
     Args:
         a, b: Vertices [m], shapes [V,3] and [W,3].
-        faces_a, faces_b: Shapes [F,3] and [G,3].
+        faces_a, faces_b: Vertex indices, shapes [F,3] and [G,3].
 
     Returns:
-        NaN where a position is not finite.
+        The distance [m]; NaN if a position is not finite.
     """
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return float("nan")

@@ -8,7 +8,7 @@ from typing import Literal
 
 TableName = Literal["table1", "table2", "figure5", "figure7", "figure9", "figure12", "category", "long", "recipe"]
 
-RESULTS = Path("benchmarks/results")  # where tables go by default
+RESULTS = Path("benchmarks/results")  # default folder of tables
 
 
 @dataclass(frozen=True)
@@ -50,4 +50,4 @@ class OptionMissing(ValueError):
 
 
 class DataLacks(ValueError):
-    """The data set has nothing that this table compares; says which command makes it."""
+    """The data set lacks what this table compares; the message has the command that makes it."""

@@ -18,7 +18,7 @@ from warpgarment.view import draw
 from .options import RESULTS
 from .protocol import FIGURES, STARTS
 
-INCHES = 0.24  # a bar's height
+INCHES = 0.24  # height of a bar [inches]
 COLOURS = {"warm": draw.CORAL, "cold": draw.OCHRE}
 PANELS = ("mean_vertex_error_cm", "geodesic_distortion_m")
 SWEPT = {"power": "power p", "radius": "radius r [m]"}
@@ -26,10 +26,10 @@ MOMENTS = 6
 
 
 class Keeper:
-    """Keeps warm rollouts of some sequences to draw them: an `observe` of `protocol.measure`.
+    """Keeps warm rollouts of some sequences for pictures; an argument `observe` of `protocol.measure`.
 
     Args:
-        names: Of the sequences.
+        names: Names of the sequences.
     """
 
     def __init__(self, names: set[str]) -> None:
@@ -49,14 +49,15 @@ def rollouts(
     size: tuple[int, int] = (200, 290),
     samples: int = 2,
 ) -> bool:
-    """Draws what was kept: a row of moments of the network and one of the recording, for each sequence.
+    """Draws the kept rollouts: for each sequence a row of frames of the network and one of the recording.
 
     Args:
-        path: PNG to write.
-        keeper: Which has seen the rollouts.
-        titles: (text, sequence) of each pair of rows; a sequence is drawn once, those that were not kept are left out.
-        size: Of a picture [pixels].
-        samples: Samples a pixel in each direction.
+        path: PNG file to write.
+        keeper: Keeper of the rollouts.
+        titles: Text and sequence of each pair of rows; a sequence is drawn once, and sequences that were not kept are
+            left out.
+        size: Width and height of a picture in pixels.
+        samples: Number of samples per pixel in each direction.
 
     Returns:
         Whether there was anything to draw.
@@ -87,7 +88,7 @@ def rollouts(
 
 
 def results_file(config: Any, name: str) -> Path:
-    """A file beside those of the table."""
+    """Path of a file beside those of the table."""
     return Path(config.out or RESULTS) / name
 
 
@@ -117,14 +118,14 @@ def bars(path: Path, rows: Ordered[dict[str, Any]]) -> None:
 def sweeps(path: Path, rows: Ordered[dict[str, Any]]) -> None:
     """Draws the error over power and over radius."""
     having = {key: [row for row in rows if key in row.get("value", {})] for key in SWEPT}
-    swept = {key: mine for key, mine in having.items() if len(mine) > 1} or having
+    swept = {key: swept_rows for key, swept_rows in having.items() if len(swept_rows) > 1} or having
     figure, axes = axes_of(len(swept), height=3.6, width=4.6)
     baselines: dict[str, Any] = next((row["mean"] for row in rows if row["row"] == "baselines"), {})
-    for axis, (key, mine) in zip(axes, swept.items(), strict=True):
-        mine.sort(key=partial(_swept_value, key))
+    for axis, (key, swept_rows) in zip(axes, swept.items(), strict=True):
+        swept_rows.sort(key=partial(_swept_value, key))
         for start, line in (("warm", "-"), ("cold", "--")):
-            values = [shown(row["mean"][start]["network"]["mean_vertex_error_cm"]) for row in mine]
-            axis.plot([row["value"][key] for row in mine], values, f"o{line}", color=COLOURS[start], label=start)
+            values = [shown(row["mean"][start]["network"]["mean_vertex_error_cm"]) for row in swept_rows]
+            axis.plot([row["value"][key] for row in swept_rows], values, f"o{line}", color=COLOURS[start], label=start)
             if start in baselines:
                 level = shown(baselines[start]["skinned"]["mean_vertex_error_cm"])
                 axis.axhline(level, ls=line, color=draw.SLATE, lw=1, label=f"skinned, {start}")
@@ -142,7 +143,7 @@ def _swept_value(key: str, row: dict[str, Any]) -> float:
 def axes_of(
     columns: int, *, height: float, width: float, rows: int = 1, share_y: bool = False
 ) -> tuple[Any, list[Any]]:
-    """An empty figure and its axes, [inches]."""
+    """An empty figure and its axes; height and width of the figure are in inches."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -152,10 +153,10 @@ def axes_of(
 
 
 def save(figure: Any, path: Path) -> None:
-    """Writes a figure as PNG whatever the path is called."""
+    """Writes a figure as PNG, for any suffix of the path."""
     figure.savefig(path, dpi=130, format="png")
 
 
 def shown(value: float) -> float:
-    """A number that can be drawn: nothing in place of none."""
+    """A number that can be drawn; one that is not finite becomes 0."""
     return value if math.isfinite(value) else 0.0

@@ -1,8 +1,8 @@
-"""How everything is measured: rollouts of sequences from two starts, their figures, and the means of these.
+"""The protocol of all measurements: rollouts of sequences from two starts, their figures, and the means of these.
 
-Every sequence is rolled out twice: **warm**, from the ten recorded frames that a network remembers, and **cold**, from
-the first alone. From then on it runs free; only predicted frames count. Pins are tied to the body's surface, never to
-recorded positions, and the recording is compared with as it is, without smoothing.
+Every sequence is rolled out twice: **warm**, from the ten recorded frames of a network's history, and **cold**, from
+the first frame alone. After the start no recorded frames are used; only predicted frames count. Pins are tied to the
+body's surface, never to recorded positions, and the recording is compared without smoothing.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class Measured:
     """Rollouts of one network, measured.
 
     Attributes:
-        rows: Per sequence and start: figures of each method.
-        curves: (method, start) -> error over time [cm], one array a sequence.
+        rows: Figures of each method, one row per sequence and start.
+        curves: (method, start) -> error over time [cm], one array per sequence.
         skipped: Sequence -> reason.
-        frames: Frames that the network predicted.
-        seconds: What it took for them.
+        frames: Number of frames that the network predicted.
+        seconds: Time that the network took for them [s].
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -57,7 +57,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Known:
-    """What `rollouts.predict` asks of a sequence: a garment and its first frames [H,V,3], nothing after these."""
+    """The part of a sequence that `rollouts.predict` reads: a garment and its first frames [m], [H,V,3]."""
 
     garment: Garment
     vertices: np.ndarray
@@ -75,13 +75,13 @@ def measure(
     """Rolls sequences out from both starts and measures them.
 
     Args:
-        simulator: Around the network.
-        folders: Sequences; what cannot be evaluated is skipped with a reason.
-        frames: Most frames predicted per sequence; None: all there are.
-        geodesic_frames: Frames per rollout at which geodesic distortion is sampled.
-        baselines: Also roll out the baselines.
-        observe: Called for every rollout of the network with the sequence, its body, the start, the newest recorded
-            frame that was seen, and the predicted vertices [T,V,3].
+        simulator: Simulator with the network.
+        folders: Folders of the sequences; those that cannot be evaluated are skipped with a reason.
+        frames: Largest number of frames predicted per sequence; None for all.
+        geodesic_frames: Number of frames per rollout at which geodesic distortion is sampled.
+        baselines: Whether the baselines are rolled out, too.
+        observe: Function that is called for every rollout of the network with the sequence, its body, the start, the
+            index of the newest recorded frame that was an input, and the predicted vertices [m], [T,V,3].
     """
     history = simulator.network.config.history
     result = Measured()
@@ -127,7 +127,16 @@ def figures(
     body_faces: np.ndarray,
     geodesic_frames: int,
 ) -> dict[str, float]:
-    """All figures of one rollout, [T,V,3] against [T,V,3] on a body [T,U,3]; inf or NaN where it failed."""
+    """All figures of one rollout; inf or NaN if it failed.
+
+    Args:
+        vertices: Predicted positions [m], [T,V,3].
+        truth: Recorded positions [m], [T,V,3].
+        faces: Vertex indices of the garment, [F,3].
+        body_vertices: Positions of the body [m], [T,U,3].
+        body_faces: Vertex indices of the body, [G,3].
+        geodesic_frames: Number of frames at which geodesic distortion is sampled.
+    """
     finite = bool(np.isfinite(vertices).all())
     sampled = np.unique(np.linspace(0, len(vertices) - 1, max(geodesic_frames, 1)).round().astype(int))
     return {
@@ -141,17 +150,17 @@ def figures(
 
 
 def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Means over sequences, start -> method -> figure (penetration: the deepest), over those that stayed finite."""
+    """Means over the sequences that stayed finite (for penetration, the largest): start -> method -> figure."""
     result: dict[str, dict[str, dict[str, float]]] = {}
     for start in STARTS:
         for method in METHODS:
-            found = [row[method] for row in rows if row["start"] == start and method in row]
-            if not found:
+            runs = [row[method] for row in rows if row["start"] == start and method in row]
+            if not runs:
                 continue
-            good = [f for f in found if f["finite"]]
+            good = [f for f in runs if f["finite"]]
             mean = {key: float(np.mean([f[key] for f in good])) if good else math.nan for key in FIGURES}
             mean["max_penetration_m"] = max((f["max_penetration_m"] for f in good), default=math.nan)
-            result.setdefault(start, {})[method] = mean | {"failed": len(found) - len(good), "sequences": len(found)}
+            result.setdefault(start, {})[method] = mean | {"failed": len(runs) - len(good), "sequences": len(runs)}
     return result
 
 
@@ -162,14 +171,14 @@ def cells(values: dict[str, float]) -> list[str]:
 
 
 def evenly(folders: list[Path], most: int | None) -> list[Path]:
-    """At most so many of the folders, evenly spread over the list."""
+    """At most a number of the folders, evenly spread over the list; all of them for None."""
     if most is None or len(folders) <= most:
         return folders
     return [folders[(i * len(folders)) // most] for i in range(most)]
 
 
 def skipped_lines(skipped: dict[str, str]) -> list[str]:
-    """How many sequences were skipped, and why, as Markdown; nothing where none was."""
+    """The number of skipped sequences and the reasons, as lines of Markdown; empty if none was skipped."""
     if not skipped:
         return []
     count = f"{len(skipped)} sequence{'s' if len(skipped) > 1 else ''} skipped:"
@@ -177,7 +186,7 @@ def skipped_lines(skipped: dict[str, str]) -> list[str]:
 
 
 def plain(value: Any) -> Any:
-    """JSON knows neither infinity nor NaN: null."""
+    """A value for JSON, which has neither infinity nor NaN: they become None."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -190,7 +199,7 @@ def plain(value: Any) -> Any:
 def _methods(
     simulator: Simulator, sequence: Sequence, body: BodyMotion, newest: int, steps: int, start: str, baselines: bool
 ) -> dict[str, Callable[[], np.ndarray]]:
-    """What to roll out: each gives vertices of frames newest+1 .. newest+steps."""
+    """Rollouts by method: functions that return the vertices of frames newest+1 .. newest+steps [m], [steps,V,3]."""
     methods = {"network": lambda: predict(simulator, sequence, newest, steps, cold=start == "cold", body=body)}
     if baselines:
         first = np.array(sequence.vertices[newest], np.float32)

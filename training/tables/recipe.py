@@ -1,11 +1,12 @@
-"""The rows of the table of the recipe: one training setting changed in each, and what that did.
+"""The rows of the table of the recipe: one training setting changed in each, and the effect of the change.
 
 The recipe is the one that the options give. A row that would not differ from it, such as "whole garments" of a recipe
-that never splits them, is left out unless it is asked for by name.
+that never splits them, is left out unless it is named in the options.
 
 The row `paper` is section 4.3.2 of the paper as far as it is printed: no residual, the world's heading, its encoder
-layers, one step of supervision, Gaussian noise on the normalised features and nothing else against drift. Its sigma_n
-is not published; `PAPER_NOISE` is ours. Heads and geodesic weights stay as given: tables 1 and 2 are about those.
+layers, one step of supervision, Gaussian noise on the normalised features and no other measure against drift. The
+paper does not give its sigma_n; `PAPER_NOISE` is a value of this project. Heads and geodesic weights stay as given,
+since they are the subject of tables 1 and 2.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from .settings import described, differences
 from .variants import Variant
 
 AS_GIVEN = "as_given"
-PUSHFORWARD = 0.25  # share of samples from rollouts, for a recipe that has none
-PAPER_NOISE = 0.05  # standard deviations of the normalised features
-AGREE = 2.0 / 3.0  # share of rollouts that have to side with the means for a verdict
-SMALLEST = 0.01  # change of the mean error that counts, as a share
+PUSHFORWARD = 0.25  # share of samples from rollouts in the row of a recipe that has none
+PAPER_NOISE = 0.05  # noise in standard deviations of the normalised features
+AGREE = 2.0 / 3.0  # share of rollouts that must agree with the means for a verdict
+SMALLEST = 0.01  # smallest change of the mean error that counts, as a share
 NOTE = (
     "Each row changes what it says, and nothing else. Validation: the best short cold rollouts in training, by which "
     "the network was chosen. Better: rollouts whose error is below that of the recipe as given, of those that both "
@@ -33,7 +34,7 @@ NOTE = (
 
 
 def recipe(common: TrainConfig) -> list[Variant]:
-    """The rows around a recipe, itself first."""
+    """The rows around a recipe; the recipe itself is the first row."""
     noise = common.noise
 
     def displaced(factor: float) -> tuple[str, ...]:
@@ -68,25 +69,26 @@ def recipe(common: TrainConfig) -> list[Variant]:
         rows.append(Variant("pushforward", "with push-forward", (), (f"pushforward.share={PUSHFORWARD!r}",)))
     if common.unroll.steps > 1:
         rows.append(Variant("one_step", "one step at a time", (), ("unroll.steps=1",)))
-    elif not (common.compile or common.augmentation.scale):  # which unrolled training does not know
+    elif not (common.compile or common.augmentation.scale):  # unrolled training supports neither
         rows.append(Variant("unrolled", "two steps in a row", (), ("unroll.steps=2",)))
     return rows
 
 
 def differing(rows: list[Variant], common: TrainConfig) -> list[Variant]:
-    """The rows that are not the recipe itself under another name."""
+    """The rows whose training differs from that of the recipe."""
     given = described(common)
     return [row for row in rows if row.name == AS_GIVEN or described(row.of(common)) != given]
 
 
 def changes(config: TrainConfig, common: TrainConfig) -> str:
-    """What a row changes, in words."""
+    """The changes of a row, in words."""
     return "; ".join(differences(described(common), described(config))) or "nothing"
 
 
 def judged(rows: list[dict[str, Any]]) -> None:
-    """Adds to each row what its change did: `better` of `compared` rollouts, `change` of the mean error per start as a
-    share, and the `verdict`. Rows have `row`, `mean` and `sequences`; nothing is added where there is no row as given.
+    """Adds to each row the effect of its change: `better` of `compared` rollouts, `change` of the mean error per start
+    as a share, and the `verdict`. Rows have `row`, `mean` and `sequences`; without the row of the recipe nothing is
+    added.
     """
     given = next((row for row in rows if row["row"] == AS_GIVEN), None)
     if given is None:
@@ -95,8 +97,8 @@ def judged(rows: list[dict[str, Any]]) -> None:
     for row in rows:
         if row is given or "sequences" not in row:
             continue
-        pairs = [(mine, errors[key]) for key, mine in _errors(row).items() if key in errors]
-        better = sum(mine < theirs for mine, theirs in pairs)
+        pairs = [(error, errors[key]) for key, error in _errors(row).items() if key in errors]
+        better = sum(error < reference for error, reference in pairs)
         change = {
             start: _mean_error(row, start) / _mean_error(given, start) - 1.0 for start in STARTS if start in row["mean"]
         }
@@ -111,7 +113,7 @@ def judged(rows: list[dict[str, Any]]) -> None:
 
 
 def summary(rows: list[dict[str, Any]]) -> list[str]:
-    """What each row changed and what that did; then which changes helped, which hurt, and which are open. Markdown."""
+    """Markdown of each row's change and its effect, then of the changes that helped, hurt, or are undecided."""
     cells = []
     for row in (row for row in rows if "changed" in row):
         validation = "" if row["validation_cm"] is None else f"{row['validation_cm']:.2f}"
@@ -119,17 +121,17 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
         cells.append([row["label"], row["changed"], validation, better, row.get("verdict", "")])
     lines = [*grid(["", "changed", "validation [cm]", "better", "verdict"], cells), ""]
     for verdict, heading in (("helps", "Helped"), ("hurts", "Hurt"), ("open", "Open")):
-        found = [
+        labels = [
             f"{row['label']} (" + ", ".join(f"{start} {c:+.1%}" for start, c in row["change"].items()) + ")"
             for row in rows
             if row.get("verdict") == verdict
         ]
-        lines += [f"- {heading}: {'; '.join(found)}."] if found else []
+        lines += [f"- {heading}: {'; '.join(labels)}."] if labels else []
     return lines
 
 
 def _errors(row: dict[str, Any]) -> dict[tuple[str, str], float]:
-    """(sequence, start) -> error; infinite where a rollout failed."""
+    """(sequence, start) -> error [cm]; infinite if the rollout failed."""
     return {(s["sequence"], s["start"]): s["network"]["mean_vertex_error_cm"] for s in row["sequences"]}
 
 

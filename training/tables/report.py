@@ -28,16 +28,16 @@ BASELINES = ("skinned", "rigid")
 
 
 def publish(config: Any, result: dict[str, Any], body: list[str], draw: Callable[[Path], None] | None) -> Path:
-    """Writes `<table>.json`, `.md` and, where `draw` is given and pictures are wanted, `.png`.
+    """Writes `<table>.json`, `.md` and, if `draw` is given and pictures are wanted, `.png`.
 
     Args:
-        config: The `EvaluateConfig`.
-        result: With `table` and `title`; command and machine are added.
-        body: Lines of Markdown between the head and what was skipped.
-        draw: Writes a picture to a path.
+        config: Configuration of the evaluation, an `EvaluateConfig`.
+        result: Result with `table` and `title`; command and machine are added.
+        body: Lines of Markdown between the head and the list of skipped sequences.
+        draw: Function that writes a picture to a path.
 
     Returns:
-        The Markdown file.
+        Path of the Markdown file.
     """
     out = Path(config.out or RESULTS)
     name = result["table"]
@@ -61,16 +61,16 @@ def publish(config: Any, result: dict[str, Any], body: list[str], draw: Callable
 
 
 def grid(headings: list[str], rows: list[list[str]]) -> list[str]:
-    """A Markdown table, all of whose columns are aligned to the left."""
+    """A Markdown table with all columns aligned to the left."""
     return table(headings, rows, text=len(headings))
 
 
 def means_table(rows: list[dict[str, Any]], extra: dict[str, str] | None = None) -> list[str]:
-    """A Markdown table of rows with `label` and `mean` (start -> method -> figures), and baselines where they are.
+    """A Markdown table of rows with `label` and `mean` (start -> method -> figures), and of baselines if there are any.
 
     Args:
-        rows: Also holding the keys of `extra`.
-        extra: key -> heading of columns after the label.
+        rows: Rows, which also have the keys of `extra`.
+        extra: key -> heading of additional columns after the label.
     """
     extra = extra or {}
     headings = ["", *extra.values(), "start", *(heading for heading, _ in FIGURES.values()), "failed"]
@@ -86,14 +86,14 @@ def means_table(rows: list[dict[str, Any]], extra: dict[str, str] | None = None)
 
 
 def machine(device: str | None) -> dict[str, Any]:
-    """What it was measured on, and with."""
+    """The machine and the versions of packages of a measurement."""
     gpu = (device or ("cuda" if torch.cuda.is_available() else "cpu")).startswith("cuda")
     name = torch.cuda.get_device_name(device or "cuda") if gpu else "cpu"
     return {"device": name, "threads": torch.get_num_threads()} | package_versions(PACKAGES)
 
 
 def command(config: Any) -> str:
-    """The command that makes the table again; of files and folders only the names, since results travel."""
+    """The command that makes the table again; it has only the names of files and folders, since results are shared."""
     words = ["warpgarment evaluate"]
 
     def add(options: Any) -> None:

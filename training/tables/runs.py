@@ -1,8 +1,8 @@
 """Trained rows: each in a folder of its own, trained once, with the settings that all rows of a table share.
 
-`row.json` in the folder says which settings the run has, on which data, and whether it is complete. A run that is
-complete is taken as it is; one that was interrupted goes on; one with other settings, other data or another budget is
-refused, never trained over.
+`row.json` in the folder holds the settings and data of the run, and whether it is complete. A complete run is used as
+it is; an interrupted one is continued; one with other settings, other data or another budget is refused, never
+overwritten.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ RECORD = "row.json"
 
 
 class RunMismatch(ValueError):
-    """A folder holds a run that is not the one this row needs; says what differs."""
+    """A folder holds another run than the one of this row; the message lists the differences."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Run:
     """A trained row.
 
     Attributes:
-        file: The network, best in the validation rollouts.
-        steps: That its training took.
-        hours: That it took.
-        validation: Error of its best validation rollouts [cm]; None where there were none.
+        file: Checkpoint of the network that was best in the validation rollouts.
+        steps: Number of training steps.
+        hours: Time of the training [h].
+        validation: Error of its best validation rollouts [cm]; None if there were none.
     """
 
     file: Path
@@ -49,12 +49,12 @@ class Run:
 
 
 def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
-    """The run of a row; trains it, or goes on training it, unless it is complete.
+    """The run of a row; a run that is not complete is trained, or its training is continued.
 
     Args:
-        folder: Of the run.
-        config: Its settings; `out` and `resume` are set here.
-        data: From `identity`.
+        folder: Folder of the run.
+        config: Settings of the run; `out` and `resume` are set here.
+        data: Identity of the data, from `identity`.
 
     Raises:
         RunMismatch: The folder holds another run, or the training stopped before its budget was spent.
@@ -70,12 +70,12 @@ def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
         if record.get("complete"):
             return _complete(folder, record, config)
     file = train(replace(config, out=folder, resume=True))
-    gc.collect()  # its sequences and loader refer to each other, and the next row loads its own
+    gc.collect()  # sequences and loader of the run refer to each other, and the next row loads its own
     if config.steps is not None:
         done = _notes(folder / "network.safetensors").get("steps")
         if done not in (None, config.steps):
             raise RunMismatch(f"{folder}: training stopped after {done} of {config.steps} steps; run it again")
-    notes = _notes(folder / "network.safetensors")  # the last one: `file` may be of an earlier step
+    notes = _notes(folder / "network.safetensors")  # those of the last step; `file` may be of an earlier step
     record = wanted | {"complete": True, "file": Path(file).name, "sha256": _checksum(Path(file))}
     record |= {"steps": notes.get("steps"), "hours": notes.get("hours"), "validation": notes.get("rollout_error_cm")}
     _write(folder, record)
@@ -83,10 +83,10 @@ def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
 
 
 def identity(root: Path) -> dict[str, Any]:
-    """What data a run was trained on: name, and the checksum of all that is trained or validated on."""
+    """The data of a run: name, and the checksum of all sequences for training and validation."""
     digest, count = hashlib.sha256(), {}
     for split in ("train", "validation"):
-        folders = folders_of(root, split, {})  # as training does, which says what it skips
+        folders = folders_of(root, split, {})  # those of training, which reports the sequences it skips
         count[split] = len(folders)
         for folder in folders:
             digest.update(json.dumps([split, folder.name, read_manifest(folder).get("checksums")]).encode())
@@ -94,7 +94,7 @@ def identity(root: Path) -> dict[str, Any]:
 
 
 def _check_same(folder: Path, record: dict[str, Any], wanted: dict[str, Any]) -> None:
-    # A setting that came later has its default in what was recorded before
+    # A setting that was introduced later has its default value in older records.
     settings = described(TrainConfig(data=Path(), out=Path(), steps=1)) | record.get("settings", {})
     parts = [differences(record.get("data", {}), wanted["data"]), differences(settings, wanted["settings"])]
     changed = [*(f"data {text}" for text in parts[0]), *parts[1]]
@@ -107,14 +107,14 @@ def _check_same(folder: Path, record: dict[str, Any], wanted: dict[str, Any]) ->
 
 
 def _complete(folder: Path, record: dict[str, Any], config: TrainConfig) -> Run:
-    """The network of a complete run, checked to be the one that the record is about."""
+    """The network of a complete run, after a check that it is the one of the record."""
     file = folder / str(record.get("file"))
     if not file.is_file() or _checksum(file) != record.get("sha256"):
         raise RunMismatch(f"{folder}: {file.name} is missing or another than {RECORD} says; remove the folder")
     shape = asdict(checkpoint.read_metadata(file)[0])
     if shape != asdict(config.network_config()):
         raise RunMismatch(f"{file}: {'; '.join(differences(shape, asdict(config.network_config())))}")
-    error = record.get("validation")  # the name of a number that is none, where all validation rollouts failed
+    error = record.get("validation")  # the name of a number, such as "inf", if all validation rollouts failed
     return Run(file, record.get("steps"), record.get("hours"), error if isinstance(error, float) else None)
 
 

@@ -1,4 +1,4 @@
-"""Training settings as text, name=value, and as plain values that tell what a run was made with."""
+"""Training settings as text, name=value, and as plain values that identify a run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from warpgarment.training.train.config import TrainConfig
 
 OWN_OPTIONS = ("data", "out", "network", "overrides", "steps", "time_limit", "seed", "resume", "device", "threads")
-HOW = ("data", "out", "cache", "resume", "device", "threads", "ahead")  # where and how fast, not what comes out
+HOW = ("data", "out", "cache", "resume", "device", "threads", "ahead")  # settings that do not affect the result
 
 Config = TypeVar("Config")
 
@@ -22,15 +22,16 @@ def with_settings(config: TrainConfig, settings: tuple[str, ...]) -> TrainConfig
     """A training with other settings.
 
     Args:
-        config: To change.
-        settings: Each name=value; a dot leads into groups, as in `noise.position=0.001`. Values as in JSON, or text.
+        config: Configuration from which the result differs.
+        settings: Settings, name=value each; names in groups have a dot, as in `noise.position=0.001`. Values are those
+            of JSON, or text.
 
     Raises:
-        SettingError: Names the setting and what there is.
+        SettingError: A setting does not exist or has another kind of value; the error names it and those that exist.
     """
     for text in settings:
-        name, found, value = text.partition("=")
-        if not found:
+        name, separator, value = text.partition("=")
+        if not separator:
             raise SettingError(f"{text!r}: settings are name=value")
         if name in OWN_OPTIONS:
             raise SettingError(f"{name} is an option of its own (--{name.replace('_', '-')}), the same for all rows")
@@ -39,7 +40,7 @@ def with_settings(config: TrainConfig, settings: tuple[str, ...]) -> TrainConfig
 
 
 def described(config: TrainConfig) -> dict[str, Any]:
-    """All settings that the result depends on, as plain values: groups of settings with dots, the network resolved."""
+    """All settings on which the result depends, as plain values; groups have dots, and the network is resolved."""
     values = dataclasses.asdict(config)
     for name in (*HOW, "network", "overrides"):
         values.pop(name, None)
@@ -58,7 +59,7 @@ def described(config: TrainConfig) -> dict[str, Any]:
 
 
 def differences(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """What differs, in words."""
+    """The differences between two descriptions, in words."""
     names = sorted({*before, *now})
     missing = object()
     changed = [n for n in names if before.get(n, missing) != now.get(n, missing)]

@@ -1,9 +1,9 @@
-"""The rows of the tables that compare networks: what each changes, everything else being equal.
+"""The rows of the tables that compare networks: the one change of each row, with all other settings equal.
 
-Table 1 takes the manifold heads away (their places go to learned heads, so the number of heads and parameters stays),
-and the singular values (neither part of the loss nor put into the deformation gradients, section 5.2). Table 2 varies
-the power p of the attention weights softmax(-(D/r)^p) at the radius r of the given shape, and r at its p; the paper has
-D in metres, which is r = 1 m.
+Table 1 removes the manifold heads (learned heads take their places, so the number of heads and parameters does not
+change), and the singular values (which are then neither part of the loss nor put into the deformation gradients,
+section 5.2). Table 2 varies the power p of the attention weights softmax(-(D/r)^p) at the radius r of the given shape,
+and r at its p; the paper has D in metres, which is r = 1 m.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from warpgarment.training.train.config import TrainConfig
 
 from .settings import with_settings
 
-POWERS = (0.01, 0.1, 1.0, 10.0, 20.0, 50.0, 100.0)  # those of the paper
+POWERS = (0.01, 0.1, 1.0, 10.0, 20.0, 50.0, 100.0)  # powers p in the paper
 RADII = (0.05, 0.15, 0.3, 0.6, 1.0)  # metres
 
 
@@ -26,14 +26,14 @@ class RowError(ValueError):
 
 @dataclass(frozen=True)
 class Variant:
-    """A row: its name (and folder), what stands in the table, and the settings that make it different.
+    """A row: its name (and folder), its label in the table, and the settings that make it different.
 
     Attributes:
-        name: Of the row and its folder.
-        label: In the table.
-        overrides: Of the network, name=value.
-        settings: Of the training, name=value.
-        value: Where the row lies on the axis of table 2: (setting, number).
+        name: Name of the row and its folder.
+        label: Label in the table.
+        overrides: Settings of the network, name=value.
+        settings: Settings of the training, name=value.
+        value: Place of the row on the axis of table 2: setting and number.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Variant:
     value: tuple[tuple[str, float], ...] = ()
 
     def of(self, config: TrainConfig) -> TrainConfig:
-        """The row's training, from what all rows have in common."""
+        """The training of the row, from the configuration that all rows have in common."""
         changed = replace(config, overrides=(*config.overrides, *self.overrides))
         return with_settings(changed, self.settings)
 
@@ -59,7 +59,7 @@ def table1() -> list[Variant]:
 
 
 def table2(network: NetworkConfig) -> list[Variant]:
-    """The rows of table 2 around a network: powers at its radius, then radii at its power, itself once."""
+    """The rows of table 2 around a network: powers at its radius, then radii at its power; the network itself once."""
     power, radius = network.geodesic_power, network.geodesic_radius
     places = [(p, radius) for p in sorted({*POWERS, power})]
     places += [(power, r) for r in RADII if r != radius]
@@ -74,10 +74,10 @@ def table2(network: NetworkConfig) -> list[Variant]:
 
 
 def chosen(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
-    """Those of the names, in the table's order.
+    """The rows with the given names, in the table's order; all rows if there are no names.
 
     Raises:
-        RowError: There is no such row.
+        RowError: A row does not exist.
     """
     unknown = sorted(set(names) - {v.name for v in variants})
     if unknown:
@@ -86,10 +86,10 @@ def chosen(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
 
 
 def check_different(configs: dict[str, TrainConfig]) -> None:
-    """Refuses rows that are the same training, as common overrides can make them.
+    """Refuses rows with equal training, which common overrides can cause.
 
     Raises:
-        RowError: Names the two, or the row whose setting the network does not have.
+        RowError: Two rows are equal, or the network lacks a setting of a row; the error names the rows.
     """
     resolved = {}
     for name, config in configs.items():

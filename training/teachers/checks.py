@@ -1,21 +1,21 @@
-"""Checks of a teacher against what is known: a strip that hangs, a sheet that swings, a cloth that comes to rest.
+"""Checks of a teacher against known results: a strip that hangs, a sheet that swings, a cloth that comes to rest.
 
     for result in run_checks(NewtonTeacher(CONVERGED)):
         print(result)
 
-They are written against :class:`.Teacher` and hold for any. The sheets that are compared with formulas weigh 1 kg/m^2,
-so that the air around them does not matter.
+They use only :class:`.Teacher` and are valid for every teacher. The sheets that are compared with formulas weigh
+1 kg/m^2, so that the air around them does not matter.
 
-What comes out is the solver as much as the cloth. Newton's VBD, stopped after so many iterations, errs by
+The results depend on the solver as much as on the cloth. With a fixed number of iterations, Newton's VBD has the errors
 
 | substeps x iterations | hanging strip stretches | swinging sheet's period |
 | --------------------- | ----------------------- | ----------------------- |
 | 10 x 5, the default   | twice as far            | 2.3 % too long          |
 | 10 x 20, 20 x 5       | 5 %, 9 % too far        | 1.1 % too long          |
-| 20 x 10, `CONVERGED`  | as it should, 0.1 %     | 0.8 % too long          |
+| 20 x 10, `CONVERGED`  | right within 0.1 %      | 0.8 % too long          |
 
-and for stiffer, lighter or finer cloth by more: see :mod:`.newton_vbd`. What is left of the period is the mesh: half
-the edge length leaves 0.2 %.
+and larger ones for stiffer, lighter or finer cloth: see :mod:`.newton`. The remaining error of the period is that of
+the mesh: at half the edge length it is 0.2 %.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ _J01 = 2.404825557695773  # first zero of the Bessel function J0
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What came out of a check.
+    """The result of a check.
 
     Attributes:
-        name: Of what was measured.
-        measured, expected: In the same unit.
-        tolerance: Largest error of a teacher that is right.
-        unit: Of both.
+        name: Name of the measured quantity.
+        measured: Measured value, in `unit`.
+        expected: Expected value, in `unit`.
+        tolerance: Largest `error` with which the check is passed.
+        unit: Unit of the measured and the expected value.
     """
 
     name: str
@@ -54,12 +55,12 @@ class CheckResult:
 
     @property
     def error(self) -> float:
-        """Relative error; the error itself where zero is expected."""
+        """Relative error; the error in `unit` if the expected value is zero."""
         return abs(self.measured - self.expected) / (abs(self.expected) or 1.0)
 
     @property
     def passed(self) -> bool:
-        """Whether the error is within the tolerance; not where it is NaN."""
+        """Whether the error is within the tolerance; False if it is NaN."""
         return self.error <= self.tolerance
 
     def __str__(self) -> str:
@@ -71,7 +72,7 @@ class CheckResult:
 
 
 def run_checks(teacher: Teacher) -> list[CheckResult]:
-    """All checks of this file; some ten seconds with Newton on a CPU."""
+    """Results of all checks of this file, which take some ten seconds with Newton on a CPU."""
     return [hanging_strip(teacher), pendulum(teacher), *rest_on_sphere(teacher)]
 
 
@@ -85,17 +86,18 @@ def hanging_strip(
     settle: int = 20,
     tolerance: float = 0.05,
 ) -> CheckResult:
-    """How far a strip hung by its upper edge stretches under its own weight.
+    """The extension of a strip hung by its upper edge, under its own weight.
 
-    At small strain a strip of density ρ and modulus E (:attr:`.Material.modulus`), as long as L, carries ρ g s at a
-    height s above its lower end, and stretches by ∫ ρ g s / E ds = ρ g L² / (2 E). (The clamped edge keeps it from
-    contracting there, which takes about 1 % off.)
+    At small strain a strip of density ρ, modulus E (:attr:`.Material.modulus`) and length L carries ρ g s at a height s
+    above its lower end, and is extended by ∫ ρ g s / E ds = ρ g L² / (2 E). (The clamped edge cannot contract, which
+    reduces the extension by about 1 %.)
 
     Args:
-        teacher: What simulates.
-        material: By default a soft and heavy one, which stretches by 0.5 %.
-        length, width, edge: Of the strip and its mesh [m].
-        settle: Frames that it is given to come to rest.
+        teacher: Teacher to check.
+        material: Material of the strip; None for a soft and heavy one, which is extended by 0.5 %.
+        length, width: Size of the strip [m].
+        edge: Edge length of its mesh [m].
+        settle: Number of frames in which the strip comes to rest.
         tolerance: Largest relative error.
     """
     material = material or Material(density=1.0, stretch=100.0, shear=100.0, bend=1e-4)
@@ -119,7 +121,7 @@ def pendulum(
     swings: float = 0.9,
     tolerance: float = 0.03,
 ) -> CheckResult:
-    """How long a sheet takes to swing to and fro about its upper edge.
+    """The period of a sheet that swings about its upper edge.
 
     A sheet without bending stiffness is a hanging chain (Daniel Bernoulli 1732). At small amplitudes its slowest mode
     is J₀(j √(s / L)) at a height s above the lower end, j = 2.4048 the first zero of J₀, and has the period
@@ -127,11 +129,12 @@ def pendulum(
     it: the other modes are orthogonal to it. The period is twice the mean time between zeros.
 
     Args:
-        teacher: What simulates.
-        material: By default a limp and heavy one.
-        length, width, edge: Of the sheet and its mesh [m].
+        teacher: Teacher to check.
+        material: Material of the sheet; None for a limp and heavy one.
+        length, width: Size of the sheet [m].
+        edge: Edge length of its mesh [m].
         tip: Amplitude of the lower end [m].
-        swings: Number of periods simulated; two zeros need three quarters of one.
+        swings: Number of simulated periods; two zeros need three quarters of a period.
         tolerance: Largest relative error.
     """
     material = material or Material(density=1.0, stretch=1e3, shear=1e3, bend=1e-5)
@@ -161,20 +164,21 @@ def rest_on_sphere(
     depth: float = 0.01,
     motion: float = 0.02,
 ) -> list[CheckResult]:
-    """A square cloth dropped on a sphere stays outside of it and comes to rest.
+    """A square cloth dropped on a sphere, which should stay outside of it and come to rest.
 
     Args:
-        teacher: What simulates.
-        material: By default an ordinary one with friction 0.5.
-        radius: Of the sphere [m].
-        size, edge: Of the cloth and its mesh [m].
-        frames: Number of frames simulated.
-        depth: How deep a vertex may be inside, as a share of the radius.
-        motion: How much of its largest kinetic energy the cloth may have at the end.
+        teacher: Teacher to check.
+        material: Material of the cloth; None for an ordinary one with friction 0.5.
+        radius: Radius of the sphere [m].
+        size: Side of the cloth [m].
+        edge: Edge length of its mesh [m].
+        frames: Number of simulated frames.
+        depth: Largest depth of a vertex inside the sphere, as a share of the radius.
+        motion: Largest kinetic energy of the cloth at the end, as a share of its largest one.
 
     Returns:
-        The deepest vertex of the last frame as a share of the radius, and the share of the largest kinetic energy that
-        is left.
+        Depth of the deepest vertex in the last frame as a share of the radius, and the remaining share of the largest
+        kinetic energy.
     """
     import igl
 
@@ -199,7 +203,7 @@ def rest_on_sphere(
 
 
 def hanging_sheet(width: float, length: float, edge: float) -> Garment:
-    """A sheet from y = 0 down to y = -length, facing +Z, its upper edge pinned."""
+    """A sheet from y = 0 down to y = -length, facing +Z, with its upper edge pinned; lengths in metres."""
     columns, rows = max(1, round(width / edge)), max(1, round(length / edge))
     sheet = _grid(columns, rows)
     vertices = np.stack([(sheet[:, 0] - 0.5) * width, -sheet[:, 1] * length, np.zeros(len(sheet))], 1)
@@ -207,7 +211,7 @@ def hanging_sheet(width: float, length: float, edge: float) -> Garment:
 
 
 def flat_sheet(size: float, edge: float, *, height: float) -> Garment:
-    """A square sheet in the plane y = height, facing up."""
+    """A square sheet in the plane y = height, facing up; lengths in metres."""
     cells = max(1, round(size / edge))
     sheet = (_grid(cells, cells) - 0.5) * size
     vertices = np.stack([sheet[:, 0], np.full(len(sheet), height), sheet[:, 1]], 1)
@@ -226,7 +230,7 @@ def _frames(teacher: Teacher, scene: ClothScene) -> np.ndarray:
 
 
 def _swung(sheet: Garment, mode: np.ndarray, tip: float) -> np.ndarray:
-    """The sheet swung out in z by tip times the mode, its length kept."""
+    """Vertices [m], [V, 3], of the sheet displaced in z by tip times the mode, without a change of its length."""
     rest = sheet.vertices.astype(np.float64)
     heights, first = np.unique(rest[:, 1], return_index=True)
     depth, swing = -heights[::-1], tip * mode[first][::-1]  # from the pinned edge down
@@ -242,7 +246,7 @@ def _grid(columns: int, rows: int) -> np.ndarray:
 
 
 def _faces(columns: int, rows: int) -> np.ndarray:
-    """Two triangles a cell, their diagonals alternating, counter-clockwise with y downwards."""
+    """Two triangles per cell with alternating diagonals, counter-clockwise with y downwards."""
     i, j = (a.ravel() for a in np.meshgrid(np.arange(columns), np.arange(rows)))
     a = j * (columns + 1) + i
     b, c, d = a + 1, a + columns + 1, a + columns + 2

@@ -1,4 +1,4 @@
-"""What a scene must be for a teacher to simulate it, and what of it does not depend on the teacher."""
+"""Requirements on scenes, and the parts of their simulation that all teachers share."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from . import ClothScene, TeacherError
 
 
 def check_scenes(scenes: Sequence[ClothScene]) -> None:
-    """Refuses what would be simulated wrongly or read outside of arrays.
+    """Refuses scenes that would be simulated wrongly or read outside of arrays.
 
     Raises:
-        TeacherError: Names the scene, the cloth, what is wrong, and what to do.
+        TeacherError: A scene is not valid; the error names the scene, the cloth, the fault and the remedy.
     """
     for number, scene in enumerate(scenes):
         where = f"scene {number}: " if len(scenes) > 1 else ""
@@ -59,7 +59,8 @@ def _check_body(where: str, frames: np.ndarray, faces: np.ndarray) -> None:
 
 
 def used_body(scene: ClothScene) -> tuple[np.ndarray, np.ndarray]:
-    """The body without vertices that no face uses: float32 [T, U', 3], and faces int32 [G, 3]; empty without a body."""
+    """The body without unused vertices: positions [m], float32 [T, U', 3], and faces, int32 [G, 3]; empty if there is
+    no body."""
     if scene.body_frames is None or scene.body_faces is None:
         return np.zeros((len(scene), 0, 3), np.float32), np.zeros((0, 3), np.int32)
     used, faces = np.unique(scene.body_faces, return_inverse=True)
@@ -68,13 +69,13 @@ def used_body(scene: ClothScene) -> tuple[np.ndarray, np.ndarray]:
 
 
 class MovingFrame:
-    """A frame of reference that follows the body's centroid, smoothed over time; without a body it rests at the origin.
-
-    Args:
-        body_frames: Body vertices [m], float32 [T, U, 3].
-        settle: Frames before the first, in which the body stands still.
+    """Coordinates that move with the body's centroid, smoothed over time; without a body they rest at the origin.
 
     Time is counted in frames of the simulation, which has `settle` + T of them: at time t + 1, frame t is reached.
+
+    Args:
+        body_frames: Body vertices in every frame [m], float32 [T, U, 3].
+        settle: Number of frames before the first one, in which the body stands still.
     """
 
     def __init__(self, body_frames: np.ndarray, settle: int):
@@ -91,14 +92,20 @@ class MovingFrame:
             self._fixed = np.zeros(3)
 
     def origin(self, at: np.ndarray | float) -> np.ndarray:
-        """Where the frame is at some times [m], shape [..., 3]."""
+        """Position of the origin at some times [m], shape [..., 3]."""
         if self._path is None:
             return np.broadcast_to(self._fixed, (*np.shape(at), 3))
         return self._path(np.clip(at, 1.0, self._count))
 
 
 def bound_to_body(points: np.ndarray, body_points: np.ndarray, body_faces: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Where points are on a body: nearest face int [P], barycentric coordinates [P, 3], height above it [P] [m]."""
+    """Places of points on a body: nearest face, int [P]; barycentric coordinates, [P, 3]; height above it [m], [P].
+
+    Args:
+        points: Points [m], shape [P, 3].
+        body_points: Vertices of the body [m], shape [U, 3].
+        body_faces: Vertex indices of the body, shape [G, 3].
+    """
     import igl
 
     points, body_points = points.astype(np.float64), body_points.astype(np.float64)

@@ -93,7 +93,7 @@ class Run:
         """The first process says how late it is; what follows from that changes only here."""
         self.now = self.elapsed()
         if self.config.time_limit is not None:
-            self.now = self.group.told(self.now)
+            self.now = self.group.from_first(self.now)
         if self.whole_from == math.inf and self.progress(self.step) >= self.config.split_share:
             self.whole_from = self.step + self.config.ahead + 2  # batches before are built, or being built
 
@@ -254,7 +254,7 @@ class Run:
         self.validate()
         self.save()
         self.log.close()
-        best = self.group.told(self.best)
+        best = self.group.from_first(self.best)
         return self.out / ("best.safetensors" if math.isfinite(best) else "network.safetensors")
 
     # Small things

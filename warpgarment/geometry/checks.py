@@ -1,8 +1,8 @@
-"""What a mesh must satisfy, and the sentences that say what is wrong, where, and what to do.
+"""Requirements on meshes, and errors that name the fault, its place and the remedy.
 
 A rest mesh is refused unless every edge has one or two faces, neighbouring faces agree on their outside, every face has
-an area and every vertex a face. Two patches that touch in a single vertex are accepted: nothing that follows needs
-more. A body mesh need only be finite with indices in range, because the distance queries skip faces that have no area.
+an area and every vertex a face. Two patches that touch in a single vertex are accepted, since no later step needs more.
+A body mesh need only be finite with indices in range, because the distance queries skip faces that have no area.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from warpgarment.errors import MeshError
 
 REMEDY = "Use Garment.cleaned_from(vertices, faces), Garment.load(path, clean=True) for a file, or remove them."
-FLAT = 1e-6  # a face lower than this share of the mesh's size has no area: float32 positions cannot tell it from a line
+FLAT = 1e-6  # a face lower than this share of the mesh's size has no area: in float32 it does not differ from a line
 
 
 def to_numpy(array: Any) -> np.ndarray:
@@ -25,14 +25,14 @@ def to_numpy(array: Any) -> np.ndarray:
 
 
 def complain(bad: np.ndarray, what: str, problem: str, remedy: str, element: str | None = None) -> None:
-    """Raises MeshError with count, total and first index where any entry of the mask is set.
+    """Raises MeshError with count, total and first index if any entry of the mask is set.
 
     Args:
-        bad: Mask over all elements, shape [N].
+        bad: Mask over all elements, bool, shape [N].
         what: Plural name of the elements, such as ``faces``.
-        problem: What is wrong with them, after "of N faces".
-        remedy: What to do, as sentences of its own.
-        element: Singular name, where it is not `what` without its s.
+        problem: Predicate of the error's sentence, which begins with the number of elements, as in "3 of N faces".
+        remedy: One or more whole sentences that name the remedy.
+        element: Singular name of an element, if it is not `what` without its final s.
     """
     if bad.any():
         element = element or what.removesuffix("s")
@@ -43,10 +43,16 @@ def complain(bad: np.ndarray, what: str, problem: str, remedy: str, element: str
 def checked_positions(
     positions: Any, *, name: str = "vertices", frames: bool = False, finite: bool = True
 ) -> np.ndarray:
-    """Positions as contiguous float32, shape [V,3], or [T,V,3] with `frames`.
+    """Positions [m] as contiguous float32, shape [V,3], or [T,V,3] with `frames`.
+
+    Args:
+        positions: Positions [m]; NumPy, torch or nested lists.
+        name: Name of the argument, for error messages.
+        frames: Whether there is one array of positions per frame.
+        finite: Whether NaN and infinity are refused.
 
     Raises:
-        MeshError: Not numbers, another shape, no vertices, no frames, or NaN or infinity among them.
+        MeshError: The positions are not numbers, have another shape, no vertices or no frames, or are not finite.
     """
     shape = "[T,V,3]" if frames else "[V,3]"
     try:
@@ -79,8 +85,14 @@ def checked_positions(
 def checked_faces(faces: Any, vertex_count: int, *, name: str = "faces", remedy: str = "Remove them.") -> np.ndarray:
     """Faces as contiguous int32, shape [F,3], each index in [0, vertex_count).
 
+    Args:
+        faces: Vertex indices; NumPy, torch or nested lists.
+        vertex_count: Number of vertices.
+        name: Name of the argument, for error messages.
+        remedy: Sentence that names the remedy for indices out of range.
+
     Raises:
-        MeshError: Not integers, another shape, no faces, or an index out of range.
+        MeshError: The faces are not integers, have another shape, are none at all, or have an index out of range.
     """
     try:
         array = to_numpy(faces)
@@ -105,8 +117,8 @@ def repeated_vertices(faces: np.ndarray) -> np.ndarray:
 def no_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Mask [F] of faces whose smallest height is at most `FLAT` times the mesh's size.
 
-    The size is the diagonal of the bounding box, or the largest coordinate where the mesh lies far from the origin:
-    that is what float32 resolution is relative to.
+    The size is the diagonal of the bounding box, or the largest coordinate if that is larger, as for a mesh far from
+    the origin, because the resolution of float32 is relative to it.
     """
     used = vertices[np.unique(faces)].astype(np.float64)
     size = max(float(np.linalg.norm(np.ptp(used, axis=0))), float(np.abs(used).max()))
@@ -131,7 +143,12 @@ def directed_edges(faces: np.ndarray) -> np.ndarray:
 
 
 def check_rest_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Raises MeshError unless the arrays, already of the right types, form an oriented 2-manifold without leftovers."""
+    """Raises MeshError unless the mesh is an oriented 2-manifold whose vertices all have a face.
+
+    Args:
+        vertices: Positions [m], float32, shape [V,3].
+        faces: Vertex indices in range, int32, shape [F,3].
+    """
     complain(repeated_vertices(faces), "faces", "name a vertex twice", REMEDY)
     complain(no_area(vertices, faces), "faces", "have no area", REMEDY)
     complain(duplicate_faces(faces), "faces", "repeat an earlier face", REMEDY)
@@ -142,7 +159,7 @@ def check_rest_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def check_edges(faces: np.ndarray) -> None:
-    """Raises MeshError where an edge has more than two faces or two neighbours disagree on their outside."""
+    """Raises MeshError if an edge of the faces [F,3] has more than two faces, or neighbours disagree on the outside."""
     directed = directed_edges(faces)
     edges, edge_of, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
     crowded = count > 2
@@ -166,10 +183,10 @@ def check_edges(faces: np.ndarray) -> None:
 
 
 def checked_pins(pins: Any, vertex_count: int) -> np.ndarray:
-    """Pinned vertices as sorted, unique int32, shape [P]; None or nothing gives an empty array.
+    """Pinned vertices as sorted, unique int32, shape [P]; None or an empty list gives an empty array.
 
     Raises:
-        MeshError: Not a list of integers, or an index out of range.
+        MeshError: The pins are not a list of integers, or an index is out of range.
     """
     array = to_numpy([] if pins is None else pins)
     if array.size == 0:
@@ -184,7 +201,7 @@ def checked_pins(pins: Any, vertex_count: int) -> np.ndarray:
 
 
 def checked_fps(fps: Any) -> float:
-    """Frames per second as a positive, finite float, or MeshError."""
+    """Frames per second as a positive, finite float; raises MeshError for anything else."""
     value = float(fps)
     if not (np.isfinite(value) and value > 0):
         raise MeshError(f"fps must be positive and finite, got {fps}.")

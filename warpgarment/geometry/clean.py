@@ -10,23 +10,24 @@ from warpgarment.errors import MeshError
 
 from .checks import directed_edges, duplicate_faces, no_area, repeated_vertices, to_numpy
 
-MERGE = 1e-6  # vertices closer than this share of the bounding box are one
+MERGE = 1e-6  # vertices closer than this share of the bounding box are merged
 
 
 def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merges duplicate vertices, then drops what a rest mesh may not have, then agrees on an outside.
+    """Merges duplicate vertices, drops all that a rest mesh may not have, and makes the faces agree on an outside.
 
-    Dropped are vertices that are not finite and the faces on them, faces with indices out of range, faces that name a
-    vertex twice, have no area, or repeat another; of the faces that crowd an edge, the largest two stay. Faces are
-    flipped to agree with the majority, by area, of their component; where none can agree (a Möbius strip) the faces
-    on one side of the seam are dropped. Vertices without a face are dropped last.
+    Dropped are vertices that are not finite with their faces, faces with indices out of range, faces that use a vertex
+    twice, have no area or repeat another face; where more than two faces share an edge, the largest two stay. Faces are
+    flipped to agree with the majority, by area, of their component; where no agreement is possible (a Möbius strip) the
+    faces on one side of the seam are dropped. Vertices without a face are dropped last.
 
     Args:
         vertices: Positions [m], shape [V,3].
-        faces: Indices, shape [F,3].
+        faces: Vertex indices, shape [F,3].
 
     Returns:
-        Vertices float32 [V',3], faces int32 [F',3], and where each old vertex went, int64 [V], -1 for dropped ones.
+        Vertices [m], float32 [V',3]; faces, int32 [F',3]; new index of each old vertex, int64 [V], -1 if it was
+        dropped.
 
     Raises:
         MeshError: Nothing is left, or the arrays have another shape.
@@ -52,7 +53,7 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _merge(vertices: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """For each vertex, the lowest one at the same place. A grid would miss pairs across a cell's border: use a tree."""
+    """For each vertex, the lowest index at the same place, from a tree; a grid would miss pairs across its cells."""
     from scipy.spatial import cKDTree
 
     group = np.arange(len(vertices))
@@ -87,7 +88,7 @@ def _edge_of(faces: np.ndarray) -> np.ndarray:
 
 
 def _largest_two_per_edge(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Mask of faces to keep: greedily by area, a face stays while each of its edges has room for it."""
+    """Mask of faces to keep: from the largest on, a face stays if each of its edges still has fewer than two faces."""
     keep = np.ones(len(faces), dtype=bool)
     if len(faces) == 0:
         return keep
@@ -96,14 +97,14 @@ def _largest_two_per_edge(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray
     rivals = np.nonzero(crowded[edge_of].any(axis=1))[0]
     taken = np.zeros(len(crowded), dtype=np.int64)
     for face in rivals[np.argsort(-_areas(vertices, faces[rivals]), kind="stable")]:
-        mine = edge_of[face][crowded[edge_of[face]]]
-        keep[face] = (taken[mine] < 2).all()
-        taken[mine] += keep[face]
+        edges = edge_of[face][crowded[edge_of[face]]]
+        keep[face] = (taken[edges] < 2).all()
+        taken[edges] += keep[face]
     return keep
 
 
 def _orient(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Flips faces so that neighbours agree; drops one face at each edge where that cannot be."""
+    """Flips faces so that neighbours agree; drops one face at each edge where that is impossible."""
     if len(faces) == 0:
         return faces
     directed, edge_of = directed_edges(faces), _edge_of(faces).reshape(-1)
@@ -112,7 +113,7 @@ def _orient(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b = order[:-1][same], order[1:][same]
     disagree = directed[a, 0] == directed[b, 0]
     a, b = a // 3, b // 3
-    count, weight = len(faces), disagree + 1  # 1: agree, 2: one of the two must flip
+    count, weight = len(faces), disagree + 1  # 1: the two faces agree, 2: one of them must flip
     graph = coo_matrix((weight, (a, b)), shape=(count, count)).tocsr()
     graph.data = np.minimum(graph.data, 2)
     graph = graph.maximum(graph.T)

@@ -4,14 +4,15 @@ A shortest path on a triangle mesh is a chain of straight segments that bend onl
 the angles around a vertex sum to more than 2π (Mitchell, Mount and Papadimitriou 1987). So:
 
 1. From every face centroid and every such vertex, unfold the strips of faces around it into the plane, keeping for
-   each strip the window of directions that stay inside, and note what is seen through it: exact distances to the
-   neighbourhood.
-2. Chain these segments: `kernels/mesh/shortest_paths.py`.
+   each strip the window of directions that stay inside. The centroids and vertices visible through the window are at
+   exact distances.
+2. Chain these segments to shortest paths: `kernels/mesh/shortest_paths.py`.
 
 `face_geodesics` does this for all pairs, `local_geodesics` for pairs within a radius, without a matrix of F x F.
 
-With strips of unlimited length this is exact. They end at `REACH` times the source's own size, so a long straight
-segment becomes a chain of seen centroids that lie almost on it: distances are never too short, and a little too long.
+With strips of unlimited length this is exact. Strips end at `REACH` times the source's own size, so a long straight
+segment becomes a chain of visible centroids that lie almost on it: distances are never too short, and slightly too
+long.
 """
 
 from __future__ import annotations
@@ -28,15 +29,18 @@ from warpgarment.kernels.mesh.shortest_paths import Paths, neighbourhoods, unit_
 
 from .checks import check_edges, checked_faces, checked_positions, complain, no_area, repeated_vertices
 
-REACH = 2.5  # windows end this many times the source's longest edge away,
-CROSSED_REACH = 1.5  # or this many times the longest edge of any face crossed, for small faces to see past large ones,
-LEAST_DEPTH = 4  # but not before they have crossed this many faces,
-DEPTH = 400  # and in any case after this many
+# A window ends at the larger of two distances, `REACH` times the longest edge of its source and `CROSSED_REACH` times
+# the longest edge of any face it crossed (so that small faces see past large ones), but never before it has crossed
+# `LEAST_DEPTH` faces, and always after `DEPTH` faces.
+REACH = 2.5
+CROSSED_REACH = 1.5
+LEAST_DEPTH = 4
+DEPTH = 400
 SADDLE = 1e-3  # angle beyond 2 pi from which a vertex can bend a shortest path [rad]
-BLOCK = 512  # sources of one search of local distances
-FEW = 8  # sources, up to which preparing a graph for the faster search takes longer than it saves
+BLOCK = 512  # number of sources of one search of local distances
+FEW = 8  # for fewer sources, preparing a graph for the faster search takes longer than it saves
 VERSION = 2  # raise it whenever the result changes: it is part of the name under which results are kept
-MEMORY_BUDGET = 8 * 2**30  # bytes of float32 distances that are still computed: about 46,000 faces
+MEMORY_BUDGET = 8 * 2**30  # largest matrix of float32 distances [bytes]: about 46,000 faces
 
 
 def face_geodesics(rest_vertices: Any, faces: Any) -> np.ndarray:
@@ -66,11 +70,11 @@ def face_geodesics(rest_vertices: Any, faces: Any) -> np.ndarray:
 
 
 def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix:
-    """Distances over the surface between face centroids no further apart than a radius, a row per face.
+    """Distances over the surface between face centroids no further apart than a radius, one row per face.
 
-    A path no longer than the radius stays in the ball of that radius around its start. So sources are taken in blocks
-    of neighbours, and the search sees only the part of the graph around a block: time and memory grow with
-    the number of pairs found.
+    A path no longer than the radius stays in the ball of that radius around its start. Therefore sources are grouped
+    into blocks of neighbours, and each search is restricted to the part of the graph around its block: time and memory
+    grow with the number of pairs found.
 
     Args:
         rest_vertices: Positions [m], shape [V,3]; NumPy or torch.
@@ -82,25 +86,25 @@ def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix
         apart are not stored. Stored values are those of `face_geodesics`.
 
     Raises:
-        MeshError: As `face_geodesics`; pairs beyond `MEMORY_BUDGET`.
-        ValueError: A radius that is not positive.
+        MeshError: As in `face_geodesics`, or the pairs exceed `MEMORY_BUDGET`.
+        ValueError: The radius is not positive.
     """
     if not radius > 0.0:
         raise ValueError(f"radius must be positive, got {radius}")
     vertices, faces = checked_mesh(rest_vertices, faces)
     count = len(faces)
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    pairs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     stored = 0
     for block, inside, part in searches(vertices, faces, np.arange(count), radius):
         row, column = np.nonzero((part <= radius) & (part < np.inf) & (block[:, None] < inside))
-        found.append((block[row], inside[column], part[row, column]))
+        pairs.append((block[row], inside[column], part[row, column]))
         stored += 2 * len(row)
         if 8 * stored > MEMORY_BUDGET:
             raise MeshError(
                 f"Distances up to {radius:g} m between {count:,} faces need more than {MEMORY_BUDGET / 2**30:.0f} GiB. "
                 "Coarsen the garment, lower the radius, or raise warpgarment.geometry.geodesics.MEMORY_BUDGET."
             )
-    source, target, length = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    source, target, length = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     upper_half = csr_matrix((length, (source, target)), shape=(count, count))
     diagonal = csr_matrix((np.zeros(count, np.float32), np.arange(count), np.arange(count + 1)), shape=(count, count))
     return _stacked(upper_half, diagonal)
@@ -109,17 +113,17 @@ def local_geodesics(rest_vertices: Any, faces: Any, radius: float) -> csr_matrix
 def searches(
     vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray, radius: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Searches from some faces for all within a radius, block by block of neighbours.
+    """Distances from some faces to all faces within a radius, one block of neighbouring sources after another.
 
     Args:
         vertices: Positions [m], shape [V,3].
         faces: Vertex indices, shape [F,3].
-        sources: Faces to start from, shape [S].
-        radius: How far to look [m].
+        sources: Faces from which paths start, shape [S].
+        radius: Largest distance of interest [m].
 
     Yields:
-        Sources of a block, shape [s]; the faces in its box, ascending, shape [n]; and distances [m], float32, shape
-        [s,n], `inf` (or just above the radius) for what is further away.
+        Sources of a block, shape [s]; the faces in the box around it, ascending, shape [n]; distances [m], float32,
+        shape [s,n], which are `inf` (or just above the radius) for faces further away.
     """
     mesh = _Unfolding(vertices.astype(np.float64), faces.astype(np.int64))
     graph, count = _segments(mesh), len(faces)
@@ -133,12 +137,12 @@ def searches(
         of_faces = np.searchsorted(inside, count)
         part = Paths(graph[inside][:, inside], np.arange(of_faces), unit).distances(
             np.searchsorted(inside, block), radius * (1 + 1e-6)
-        )  # float32 before they are compared, so that ties end as they do in the dense matrix
+        )  # float32 before the comparison, so that ties are decided as in the dense matrix
         yield block, inside[:of_faces], part
 
 
 def _stacked(upper: csr_matrix, diagonal: csr_matrix) -> csr_matrix:
-    """The lower half, the diagonal and the upper half; a sum of matrices would drop the zeros."""
+    """The symmetric matrix of an upper half and a diagonal; a sum of matrices would drop the stored zeros."""
     count = upper.shape[0]
     parts = [upper.T.tocsr(), diagonal, upper]
     row = np.concatenate([np.repeat(np.arange(count, dtype=np.int32), np.diff(part.indptr)) for part in parts])
@@ -150,7 +154,7 @@ def _stacked(upper: csr_matrix, diagonal: csr_matrix) -> csr_matrix:
 
 
 def checked_mesh(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Float32 vertices and int32 faces of a mesh that paths can be found on; raises MeshError."""
+    """Vertices [m], float32 [V,3], and faces, int32 [F,3], of a mesh on which paths are defined; raises MeshError."""
     vertices = checked_positions(rest_vertices, name="rest_vertices")
     faces = checked_faces(faces, len(vertices))
     complain(repeated_vertices(faces) | no_area(vertices, faces), "faces", "have no area", "Run garment.cleaned().")
@@ -159,22 +163,31 @@ def checked_mesh(rest_vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray
 
 
 def distances_from(graph: csr_matrix, sources: np.ndarray, face_count: int) -> np.ndarray:
-    """Distances [m] from some faces to all, float32, shape [S,F], over a graph of `surface_graph`. Those of fewer than
-    `FEW` faces are sums of float64, and may differ in the last bit from those of many."""
+    """Distances from some faces to all faces.
+
+    Args:
+        graph: Graph of `surface_graph`, [F+K,F+K].
+        sources: Faces from which paths start, shape [S].
+        face_count: Number of faces F.
+
+    Returns:
+        Distances [m], float32, shape [S,F]. For fewer than `FEW` sources they are sums of float64, and may differ in
+        the last bit from those for more sources.
+    """
     if len(sources) < FEW:
         return dijkstra(graph, indices=sources)[:, :face_count].astype(np.float32)
     return Paths(graph, np.arange(face_count)).distances(sources)
 
 
 def surface_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
-    """Straight segments over the surface: nodes are the F face centroids, then the vertices where paths may bend.
+    """Straight segments over the surface: nodes are the F face centroids, then the K vertices where paths may bend.
 
     Args:
         vertices: Positions [m], shape [V,3].
         faces: Vertex indices, shape [F,3], every edge with one or two faces.
 
     Returns:
-        Symmetric weights [m], float64, shape [F+K, F+K].
+        Symmetric matrix of lengths [m], float64, shape [F+K,F+K].
     """
     return _segments(_Unfolding(vertices.astype(np.float64), faces.astype(np.int64)))
 
@@ -238,7 +251,7 @@ class _Unfolding:
         return np.where(forward[order][place] == backward, order[place], -1)
 
     def over_midpoints(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Neighbours by way of the middle of their edge, so that even faces without area are linked."""
+        """Segments between neighbours by way of the middle of their edge, which link even faces without area."""
         half = np.nonzero(self.twin >= 0)[0]
         to_middle = np.linalg.norm(
             np.stack([self.length / 2, np.zeros(len(self.length))], axis=1) - self._centroids(), axis=1
@@ -279,11 +292,11 @@ class _Unfolding:
         return source, half, right, left, seen
 
     def spread(self, windows: Windows) -> tuple[np.ndarray, ...]:
-        """Unfolds face after face; returns sources, targets and lengths [m] of all straight segments seen."""
+        """Unfolds face after face; returns sources, targets and lengths [m] of all visible straight segments."""
         source, half, right, left, seen = windows
         ray_right, ray_left = right, left
         reach = self.reach[source]
-        found = [seen]
+        segments = [seen]
         for depth in range(DEPTH):
             across = self.twin[half]
             go = across >= 0
@@ -308,7 +321,7 @@ class _Unfolding:
                 slack = -1e-9 * size
                 visible = (_cross(ray_right, point) >= slack * np.linalg.norm(ray_right, axis=1)) & (node >= 0)
                 visible &= _cross(point, ray_left) >= slack * np.linalg.norm(ray_left, axis=1)
-                found.append((source[visible].astype(np.int32), node[visible].astype(np.int32), size[visible]))
+                segments.append((source[visible].astype(np.int32), node[visible].astype(np.int32), size[visible]))
             beside_right, beside_left = _cross(ray_right, apex), _cross(apex, ray_left)
             tiny = 1e-12 * np.linalg.norm(apex, axis=1)
             a = beside_right > tiny * np.linalg.norm(ray_right, axis=1)  # part of the window passes right of the apex
@@ -321,7 +334,7 @@ class _Unfolding:
             right, left = np.concatenate([right[a], apex[b]]), np.concatenate([apex[a], left[b]])
             ray_right = np.concatenate([ray_right[a], narrowed_right[b]])
             ray_left = np.concatenate([narrowed_left[a], ray_left[b]])
-        return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+        return tuple(np.concatenate(part) for part in zip(*segments, strict=True))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -6,8 +6,8 @@ all pairs of a garment. So it is interpolated instead, on both sides,
     exp(-(D/r)^p)  ~  P exp(-(D_c/r)^p) P^T        D_c [C,C] distances between centres, P [F,C] with NEAR entries a row
 
 1. Centres are chosen one after another, each the face furthest from all before it.
-2. Distances are found from each centre to what is near, and chained over centres with Dijkstra's algorithm, as faces
-   are in `geodesics.py`.
+2. Distances are computed from each centre to the faces near it, and chained over centres with Dijkstra's algorithm, as
+   in `geodesics.py` over faces.
 3. A row of P is the moving least squares fit of a quadratic in the face's tangent plane, taken at its centroid
    (Levin 1998): exact for quadratics, and its entries sum to one.
 
@@ -29,19 +29,19 @@ from warpgarment.kernels.mesh.shortest_paths import Paths
 
 from .geodesics import checked_mesh, searches
 
-CENTRES = 4096  # at most; D_c takes 64 MiB
-NEAR = 12  # centres a face is interpolated from
-NEAR_REACH, CHAIN_REACH = 3.0, 6.0  # how far these are, and the links between centres, in fill distances
+CENTRES = 4096  # largest number of centres; D_c takes 64 MiB
+NEAR = 12  # number of centres from which a face is interpolated
+NEAR_REACH, CHAIN_REACH = 3.0, 6.0  # largest distance of these, and of links between centres, in fill distances
 LARGEST_ROW = 6.0  # sum of absolute entries of a row of P, beyond which it is replaced by a plain mean
 VERSION = 2  # raise it whenever the result changes: it is part of the name under which results are kept
 
 
 class PooledGeodesics(NamedTuple):
-    """What `pooled_geodesics` finds: independent of the radius and power of the weights."""
+    """Result of `pooled_geodesics`; it does not depend on the radius and power of the weights."""
 
-    distances: np.ndarray  # float32 [C,C], between centres [m]; inf where there is no way
-    nearest: np.ndarray  # int32 [F,NEAR], centres of each face; 0 where weight is 0
-    weight: np.ndarray  # float32 [F,NEAR], rows sum to one
+    distances: np.ndarray  # float32 [C,C], distances between centres [m]; inf between components
+    nearest: np.ndarray  # int32 [F,NEAR], centres near each face; 0 where the weight is 0
+    weight: np.ndarray  # float32 [F,NEAR], weights of these centres; rows sum to one
 
 
 def pooled_geodesics(rest_vertices: Any, faces: Any, centres: int = CENTRES) -> PooledGeodesics:
@@ -50,10 +50,10 @@ def pooled_geodesics(rest_vertices: Any, faces: Any, centres: int = CENTRES) -> 
     Args:
         rest_vertices: Positions [m], shape [V,3]; NumPy or torch.
         faces: Vertex indices of an oriented manifold mesh, shape [F,3].
-        centres: Number of centres, at most that of faces.
+        centres: Number of centres; a mesh with fewer faces gets one centre per face.
 
     Raises:
-        MeshError: As `face_geodesics`, but for the number of faces.
+        MeshError: As in `face_geodesics`, except for the limit on the number of faces.
     """
     vertices, faces = checked_mesh(rest_vertices, faces)
     corners = vertices.astype(np.float64)[faces]
@@ -76,8 +76,11 @@ def pooled_geodesics(rest_vertices: Any, faces: Any, centres: int = CENTRES) -> 
 
 
 def _furthest_points(centroids: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, float]:
-    """Faces far from each other, ascending, and the distance [m] within which every face has one; walks go from face
-    to face over edges, which is too long a way, but serves to spread them, and every piece gets one."""
+    """Faces far from each other, ascending, and the distance [m] within which every face has one of them.
+
+    Distances are those of walks from face to face over edges. They are too long, but sufficient to spread the chosen
+    faces, and every connected piece gets at least one.
+    """
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     key = edges[:, 0] * (edges.max() + 1) + edges[:, 1]
     order = np.argsort(key, kind="stable")
@@ -107,7 +110,7 @@ def _nearest(count: int, face: np.ndarray, centre: np.ndarray, length: np.ndarra
 
 
 def _interpolation(corners: np.ndarray, chosen: np.ndarray, index: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Rows of P, float32 [F,NEAR]."""
+    """Rows of P, float32 [F,NEAR], without unit."""
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     e1 = e1 / np.linalg.norm(e1, axis=1, keepdims=True)
     e2 = e2 - (e1 * e2).sum(axis=1, keepdims=True) * e1

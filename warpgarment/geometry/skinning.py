@@ -19,15 +19,16 @@ def linear_blend_skinning(
 
     Args:
         rest_vertices: Positions in the rest pose [m], shape [V,3].
-        bone_indices: Bones of each vertex, integers, shape [V,K].
-        bone_weights: Their weights, each row summing to 1, shape [V,K].
+        bone_indices: Bones that move each vertex, integers, shape [V,K].
+        bone_weights: Weight of each of these bones, every row summing to 1, shape [V,K].
         bone_transforms: Rest-to-posed transforms [R | t] of each bone, shape [T,B,3,4].
 
     Returns:
         Posed positions [m], float32, shape [T,V,3].
 
     Raises:
-        MeshError: Shapes that do not fit, bones that do not exist, weights that do not sum to 1, NaN or infinity.
+        MeshError: Shapes do not fit each other, a bone does not exist, weights do not sum to 1, or a number is not
+            finite.
     """
     rest = checked_positions(rest_vertices, name="rest_vertices").astype(np.float64)
     indices, weights = to_numpy(bone_indices), to_numpy(bone_weights).astype(np.float64)

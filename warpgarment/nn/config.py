@@ -28,7 +28,7 @@ class NetworkConfig:
     norm_first: bool = False
     activation: str = "relu"  # or "gelu"
     fps: float = 30.0  # of the motions it was trained on
-    architecture: str = "faces"  # every face a token; or "patches", see patch_network.py, to which alone belong:
+    architecture: str = "faces"  # every face a token; or "patches", see patches/network.py, to which alone belong:
     patch_spacing: float = 0.08  # metres between patches; `embedding` and `feed_forward` are those of their tokens
     face_embedding: int = 128
     face_feed_forward: int = 128

@@ -30,7 +30,7 @@ class BodyMotion:
 
     Attributes:
         vertices: Positions [m], Y up, float32, shape [T,V,3].
-        faces: Counter-clockwise seen from outside, int32, shape [F,3].
+        faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
         fps: Frames per second.
 
     Args:
@@ -39,8 +39,8 @@ class BodyMotion:
         fps: Frames per second, positive.
 
     Raises:
-        MeshError: Other shapes, no frames or faces, NaN or infinity (named by frame), indices out of range, no face
-            with an area, or a rate that is not positive.
+        MeshError: The arrays have other shapes, no frames or no faces, numbers that are not finite (named by frame),
+            indices out of range, no face with an area, or a rate that is not positive.
     """
 
     def __init__(self, vertices: Any, faces: Any, fps: float = 30.0):
@@ -85,8 +85,8 @@ class BodyMotion:
         """Reads a motion.
 
         - ``.npz`` with `vertices` [T,V,3], `faces` [F,3] and `fps`;
-        - ``.npz`` with `rest_vertices`, `faces`, `bone_indices`, `bone_weights`, `bone_transforms`, `fps` and, where
-          parts such as hands take no part in collisions, `collider_faces` (bool, [F]);
+        - ``.npz`` with `rest_vertices`, `faces`, `bone_indices`, `bone_weights`, `bone_transforms`, `fps` and, if
+          parts such as hands are no colliders, `collider_faces` (bool, [F]);
         - ``.pc2`` with a mesh of the same name beside it (``.obj``, else ``.ply``);
         - ``.usd``, ``.usda``, ``.usdc``, ``.usdz``: a mesh with time samples;
         - a folder of ``.obj`` files with the same faces, in the order of the numbers in their names;
@@ -96,12 +96,13 @@ class BodyMotion:
             path: File or folder.
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that
                 USD files are converted by their own `metersPerUnit` and `upAxis`.
-            fps: Overrides the file's rate; 30 where neither says.
-            collider: Keep only the file's `collider_faces`, where it has any.
-            mesh: Name of the mesh to read where a USD file holds several.
+            fps: Frames per second, in place of the file's; None takes the file's rate, or 30 if it has none.
+            collider: Whether only the file's `collider_faces` are kept, if it has any.
+            mesh: Name of the mesh to read, if a USD file holds several.
 
         Raises:
-            MeshError: The file is not of its kind or truncated, arrays do not fit each other, or as the constructor.
+            MeshError: The file is not of its kind or truncated, its arrays do not fit each other, or the constructor
+                refuses them.
             FileNotFoundError: There is no such file.
         """
         from warpgarment.io.sequence import read_sequence
@@ -116,15 +117,21 @@ class BodyMotion:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes .npz, .usd (.usda, .usdc), .pc2 with .obj beside it, or a folder of .obj; completely or not at all."""
+        """Writes the motion as .npz, .usd (.usda, .usdc), .pc2 with .obj beside it, or a folder of .obj files.
+
+        The output is written completely or not at all.
+
+        Args:
+            path: File or folder to write; its suffix decides the format.
+        """
         from warpgarment.io.sequence import write_sequence
 
         write_sequence(Path(path), self.vertices, self.faces, self.fps, name=Path(path).stem or "body")
 
     def resampled(self, fps: float) -> BodyMotion:
-        """The motion at another rate, positions interpolated linearly in time.
+        """The motion at another rate, with positions interpolated linearly in time.
 
-        Starts at the first frame and lasts as long as whole frames fit: floor((T - 1) fps' / fps) + 1 frames.
+        It starts at the first frame and has as many whole frames as fit: floor((T - 1) fps' / fps) + 1.
 
         Args:
             fps: New frames per second.
@@ -144,10 +151,10 @@ class BodyMotion:
         return self._derived(vertices, self.faces, fps, self.degenerate_faces)
 
     def submesh(self, face_mask: Any) -> BodyMotion:
-        """The motion of some faces only, without the vertices that no face needs any more.
+        """The motion of some faces only, without the vertices that belong to none of them.
 
         Args:
-            face_mask: True for faces to keep, bool, shape [F].
+            face_mask: Mask of the faces to keep, bool, shape [F].
 
         Raises:
             MeshError: The mask has another shape or keeps nothing.

@@ -1,4 +1,4 @@
-"""How far a garment's vertices are kept from the body."""
+"""Distance at which a garment's vertices are kept from the body."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from .garment import Garment
 
-CLOSEST = 0.004  # metres between a vertex and the body, at least
-CLEARANCE_PER_EDGE = 0.2  # ... and as a share of the mean edge length
+CLOSEST = 0.004  # least distance between a vertex and the body [m]
+CLEARANCE_PER_EDGE = 0.2  # least distance as a share of the mean edge length
 
 
 def clearance(garment: Garment) -> float:
     """Distance that vertices keep from the body [m]: 4 mm, or a fifth of the mean edge length if that is more.
 
-    Between the vertices of a coarse garment a round body comes nearer; see also `surface`.
+    A round body comes nearer between the vertices of a coarse garment; see also `sim.surface`.
     """
     i, j = garment.edges.T
     edge = float(np.linalg.norm(garment.vertices[i] - garment.vertices[j], axis=1).mean())

@@ -1,4 +1,4 @@
-"""Carries a garment from the pose it was modelled on to the first frame of a motion."""
+"""Carries a garment from the pose in which it was modelled to the first frame of a motion."""
 
 from __future__ import annotations
 
@@ -20,33 +20,34 @@ from .body import BodyMotion
 from .clearance import clearance as least_clearance
 from .garment import Garment
 
-NEAREST = 48  # body faces that a garment vertex listens to
-SMOOTHING = 0.08  # radius [m] over which motions are averaged; wider drags the garment into a bent body
+NEAREST = 48  # number of body faces whose motions a garment vertex blends
+SMOOTHING = 0.08  # radius [m] over which motions are averaged; a larger one drags the garment into a bent body
 ATTACHMENT = 0.2  # length [m] over which the garment may drift from its carried position to avoid stretch
-CONTACT = 0.002  # the same for vertices pushed out of the body
-ROUNDS = 12  # local-global rounds
-MOST_CLEARANCE = 0.02  # clearance of the rest pose beyond this is not kept [m]
+CONTACT = 0.002  # length [m] over which a vertex may drift from the position to which a contact pushes it
+ROUNDS = 12  # number of local-global rounds
+MOST_CLEARANCE = 0.02  # largest clearance of the rest pose that is kept [m]
 
 
 def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float | None = 0.004) -> np.ndarray:
-    """The garment's vertices in the first frame of a motion, given the body it was modelled on.
+    """The garment's vertices in the first frame of a motion, given the body on which it was modelled.
 
     1. Each garment vertex takes a blend of the rigid motions rest -> first of its nearest body faces, weighted by
        area, closeness and whether they face it; the blends are averaged over the garment's edges, so that neighbours
        between two legs or at an armpit do not tear apart.
-    2. As-rigid-as-possible rounds (Sorkine and Alexa 2007, per triangle as Liu et al. 2008) take out the stretch,
-       loosely attached to the result of 1, and push out vertices closer to the body than their clearance.
+    2. As-rigid-as-possible rounds (Sorkine and Alexa 2007, per triangle as Liu et al. 2008) remove the stretch while
+       the vertices stay loosely attached to the result of 1, and push out vertices that are closer to the body than
+       their clearance.
 
-    A body that only turns and shifts carries the garment along exactly. Clearance is half the distance a vertex had at
-    rest, between `epsilon` and 2 cm, so layers that were apart stay in order where there is room. Limits: contact is
-    per vertex, the garment does not see itself, and a pose far from the rest pose (arms up, deep squat) is better
-    reached by a motion that starts at the rest pose and moves there within a second.
+    A body that only turns and shifts carries the garment along exactly. The clearance of a vertex is half its distance
+    at rest, between `epsilon` and 2 cm, so that layers stay in order where there is enough space. Limits: contacts are
+    those of vertices, the garment does not collide with itself, and a pose far from the rest pose (arms up, deep squat)
+    is better reached by a motion that starts at the rest pose and moves there within a second.
 
     Args:
         garment: Garment around the rest body.
-        body_rest: The body the garment was modelled on: `(vertices [U,3], faces [G,3])`, or a BodyMotion, whose first
-            frame counts.
-        body_first: The same body in the first frame: positions [m], shape [U,3], or as `body_rest`.
+        body_rest: Body on which the garment was modelled: `(vertices [U,3], faces [G,3])` with positions in metres, or
+            a BodyMotion, of which the first frame counts.
+        body_first: That body in the first frame of the motion: positions [m], shape [U,3], or as `body_rest`.
         epsilon: Least distance to the body [m]. None: what a simulator keeps by default, 4 mm, or a fifth of the
             garment's mean edge length if that is more.
 
@@ -70,7 +71,7 @@ def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float | N
     clearance = np.clip(0.5 * body.query(_tensor(points)).distance.numpy(), epsilon, max(MOST_CLEARANCE, epsilon))
     body.update(torch.from_numpy(first))
     result = _relax(garment, carried, body, clearance.astype(np.float64))
-    for _ in range(3):  # what the soft contacts left
+    for _ in range(3):  # pushes out the vertices that the soft contacts left too close
         inside, target = _contacts(result, body, np.full(len(result), float(epsilon)))
         result[inside] = target[inside]
         if not inside.any():
@@ -79,7 +80,7 @@ def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float | N
 
 
 def _body(body: Any, faces: np.ndarray | None, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """First-frame vertices and faces of whatever names a body."""
+    """Vertices and faces of a body in its first frame, from any of the forms that `fit` accepts."""
     if isinstance(body, BodyMotion):
         vertices, own = body.vertices[0], body.faces
     elif isinstance(body, tuple) and len(body) == 2:
@@ -95,7 +96,7 @@ def _body(body: Any, faces: np.ndarray | None, name: str) -> tuple[np.ndarray, n
 
 
 def _frames(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Columns e1, e2, unit normal, shape [F,3,3]; the normal is nan where there is no area."""
+    """Face frames: columns e1, e2 [m] and the unit normal, shape [F,3,3]; the normal is nan for a face without area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -137,7 +138,7 @@ def _carry(points: np.ndarray, rest: np.ndarray, first: np.ndarray, faces: np.nd
 
 
 def _smooth(garment: Garment, transforms: np.ndarray) -> np.ndarray:
-    """Averages over the edges; a motion that all vertices share comes out unchanged."""
+    """Transforms averaged over the edges; a motion that all vertices share is not changed."""
     i, j = garment.edges.T
     count = len(transforms)
     ones = np.ones(2 * len(i))
@@ -151,7 +152,10 @@ def _smooth(garment: Garment, transforms: np.ndarray) -> np.ndarray:
 
 
 def _relax(garment: Garment, carried: np.ndarray, body: BodyMeshes, clearance: np.ndarray) -> np.ndarray:
-    """Local-global rounds: min sum_f sum_k w_k |(x_i - x_j) - R_f (p_i - p_j)|^2 + attachments, w_k half cotangents."""
+    """Local-global rounds: min sum_f sum_k w_k |(x_i - x_j) - R_f (p_i - p_j)|^2 + attachments.
+
+    w_k are half the cotangents of a face.
+    """
     points, faces = garment.vertices.astype(np.float64), garment.faces
     weights = half_cotangents(garment.vertices, faces)
     i, j = np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)  # the edge opposite to corner k
@@ -180,7 +184,7 @@ def _areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _contacts(x: np.ndarray, body: BodyMeshes, clearance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which vertices are closer to the body than their clearance, and where on that offset they belong."""
+    """Vertices that are closer to the body than their clearance, and their positions at that clearance [m]."""
     query = body.query(_tensor(x))
     distance, closest = query.distance.numpy().astype(np.float64), query.closest.numpy().astype(np.float64)
     face = body.faces.numpy()[np.maximum(query.face.numpy(), 0)]

@@ -1,4 +1,4 @@
-"""A garment's rest mesh and what is computed from it once."""
+"""A garment's rest mesh and the quantities that are computed from it once."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from warpgarment.geometry.pooled_geodesics import PooledGeodesics
 
 
-POOLED = 10_000  # faces beyond which the network's weights are pooled: F x F of them would take 400 MB
-KEPT = 1_000  # faces from which distances are kept on disk; with less they are quickly found
+POOLED = 10_000  # with more faces the network's weights are pooled: F x F of them would take 400 MB
+KEPT = 1_000  # from this number of faces on, distances are kept on disk; for fewer faces they are computed quickly
 
 
 class Garment:
@@ -35,23 +35,24 @@ class Garment:
 
     Attributes:
         vertices: Rest positions [m], Y up, float32, shape [V,3].
-        faces: Counter-clockwise seen from outside, int32, shape [F,3].
-        pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty where there are none.
-        name: For messages and file names.
+        faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
+        pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty if there are none.
+        name: Name of the garment, for messages and file names.
 
-    What is cached (`edges`, `components`, `face_frames`, `geodesics`, `pooled_geodesics`, `laplacian`) belongs to
-    these arrays: make a new garment instead of changing them.
+    The cached properties (`edges`, `components`, `face_frames`, `geodesics`, `pooled_geodesics`, `laplacian`) are
+    computed from these arrays once: do not change the arrays, make a new garment instead.
 
     Args:
         vertices: Rest positions [m], shape [V,3]; NumPy, torch or nested lists.
         faces: Vertex indices, integers, shape [F,3].
-        pins: Vertex indices, shape [P].
-        name: Any text.
+        pins: Vertices to tie to the body's surface, integers, shape [P]; None for none.
+        name: Name of the garment, any text.
 
     Raises:
-        MeshError: Names the element, the count and the remedy, for: other shapes, nothing in them, NaN or infinity,
-            indices out of range, a vertex twice in a face, faces without area (relative to the mesh's size), faces
-            given twice, edges of more than two faces, neighbours that disagree on the outside, vertices without a face.
+        MeshError: The arrays have other shapes or are empty, or there are numbers that are not finite, indices out of
+            range, faces with a vertex twice or without area (relative to the mesh's size), faces given twice, edges of
+            more than two faces, neighbours that disagree on the outside, or vertices without a face. The error names
+            the element, the count and the remedy.
     """
 
     def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = ""):
@@ -76,18 +77,18 @@ class Garment:
         (.glb, .gltf) have vertices at exactly the same place joined again.
 
         Args:
-            path: The file.
+            path: File to read.
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that
                 USD files are converted by their own `metersPerUnit` and `upAxis`.
-            clean: Repair the mesh as `cleaned_from` does, instead of refusing it.
-            mesh: Name of the mesh to read where a USD file holds several.
+            clean: Whether a mesh that the constructor would refuse is repaired as by `cleaned_from`.
+            mesh: Name of the mesh to read, if a USD file holds several.
 
         Raises:
-            MeshError: The file is not of its kind, is truncated, or holds a mesh that a garment cannot have.
+            MeshError: The file is not of its kind, is truncated, or holds a mesh that the constructor refuses.
             FileNotFoundError: There is no such file.
 
         Warns:
-            UserWarning: The garment is bigger than 10 m or smaller than 5 cm, so its unit is probably another.
+            UserWarning: The garment is larger than 10 m or smaller than 5 cm, so that the unit is probably wrong.
         """
         from warpgarment.io.mesh import read_mesh
 
@@ -100,7 +101,13 @@ class Garment:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes .obj, .ply, .npz or .usd (.usda, .usdc), completely or not at all. Pins are kept in .npz only."""
+        """Writes the garment as .obj, .ply, .npz or .usd (.usda, .usdc), completely or not at all.
+
+        Only .npz files keep the pins.
+
+        Args:
+            path: File to write; its suffix decides the format.
+        """
         from warpgarment.io.mesh import write_mesh
 
         write_mesh(Path(path), self.vertices, self.faces, pins=self.pins, name=self.name)
@@ -109,16 +116,16 @@ class Garment:
     def cleaned_from(cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "") -> Garment:
         """A garment from a mesh that the constructor refuses.
 
-        Vertices closer than 1e-6 of the bounding box become one; vertices that are not finite go with their faces;
-        faces go that have indices out of range, a vertex twice, no area, or that repeat another; where more than two
-        faces share an edge the largest two stay; neighbours are flipped to agree, the majority deciding; vertices
-        without a face go. Pins follow their vertices.
+        Vertices closer than 1e-6 of the bounding box are merged; vertices that are not finite are removed with their
+        faces; faces with indices out of range, with a vertex twice or without area, and repeated faces are removed;
+        where more than two faces share an edge, the largest two stay; neighbours that disagree on the outside are
+        flipped to agree with the majority; vertices without a face are removed. Pins follow their vertices.
 
         Args:
             vertices: Rest positions [m], shape [V,3].
             faces: Vertex indices, shape [F,3].
-            pins: Vertex indices before cleaning, shape [P].
-            name: Any text.
+            pins: Vertices to tie to the body's surface, as indices before cleaning, shape [P]; None for none.
+            name: Name of the garment, any text.
 
         Raises:
             MeshError: Nothing is left, or the arrays have another shape.
@@ -138,14 +145,17 @@ class Garment:
 
     @cached_property
     def components(self) -> tuple[np.ndarray, np.ndarray, int]:
-        """Connected pieces by lowest vertex: of each vertex int32 [V], of each face int32 [F], and their count."""
+        """Connected pieces, numbered by their lowest vertex.
+
+        Piece of each vertex, int32 [V]; piece of each face, int32 [F]; number of pieces.
+        """
         from warpgarment.kernels.mesh.laplacian import components
 
         return components(len(self.vertices), self.faces)
 
     @cached_property
     def face_frames(self) -> np.ndarray:
-        """Columns e1, e2 (the edges from a face's first vertex) and the unit normal, float32, shape [F,3,3]."""
+        """Columns e1, e2 (the edges from a face's first vertex [m]) and the unit normal, float32, shape [F,3,3]."""
         corners = self.vertices.astype(np.float64)[self.faces]
         e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         normal = np.cross(e1, e2)
@@ -156,7 +166,7 @@ class Garment:
     def geodesics(self) -> np.ndarray:
         """Distances over the surface between face centroids [m], float32, shape [F,F]; see `face_geodesics`.
 
-        From 1,000 faces they are kept on disk, see `cache.remembered`.
+        From 1,000 faces on they are kept on disk; see `warpgarment.io.cache.remembered`.
         """
         from warpgarment.geometry.geodesics import VERSION, face_geodesics
 
@@ -172,7 +182,7 @@ class Garment:
 
     @property
     def pools(self) -> bool:
-        """Whether the network's geodesic weights are pooled: beyond 10,000 faces."""
+        """Whether the network's geodesic weights are pooled, as for garments of more than 10,000 faces."""
         return len(self.faces) > POOLED
 
     @cached_property
@@ -186,17 +196,17 @@ class Garment:
             "nearest": ("int32", (count, NEAR)),
             "weight": ("float32", (count, NEAR)),
         }
-        found = remembered(
+        arrays = remembered(
             f"pooled-{VERSION}",
             [self.vertices, self.faces, CENTRES],
             expected,
             lambda: pooled_geodesics(self.vertices, self.faces)._asdict(),
         )
-        return PooledGeodesics(**found)
+        return PooledGeodesics(**arrays)
 
     @cached_property
     def laplacian(self) -> csr_matrix:
-        """Cotangent Laplacian of the rest mesh, positive semi-definite, float64, shape [V,V]."""
+        """Cotangent Laplacian of the rest mesh, positive semi-definite, without unit, float64, shape [V,V]."""
         from warpgarment.kernels.mesh.laplacian import cotangent_laplacian
 
         return cotangent_laplacian(self.vertices, self.faces)

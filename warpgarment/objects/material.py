@@ -1,4 +1,4 @@
-"""What a garment is made of."""
+"""The material of a garment's cloth."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Material:
         density: Mass per area [kg/m^2].
         stretch: Resistance to change of area: first Lame parameter of the sheet [N/m].
         shear: Resistance to shear, and with it to stretch: second Lame parameter of the sheet [N/m].
-        bend: Moment per angle of a bent edge and its length [N].
-        damping: Share of the membrane's shear stiffness that damps its rate of change [s].
-        friction: Coulomb coefficient against the body and other cloth.
+        bend: Moment of a bent edge per angle and per length of the edge [N].
+        damping: Damping of the membrane's rate of change, as a share of its shear stiffness [s].
+        friction: Coulomb coefficient against the body and other cloth, without unit.
     """
 
     density: float = 0.2
@@ -39,9 +39,9 @@ class Material:
 
     @property
     def poisson(self) -> float:
-        """Poisson's ratio of the sheet: how far it contracts across, as a share of how far it stretches."""
+        """Poisson's ratio of the sheet: its contraction across as a share of its extension along, without unit."""
         return self.stretch / (self.stretch + 2.0 * self.shear)
 
     def as_dict(self) -> dict[str, float]:
-        """Plain values for a manifest."""
+        """The attributes by name, in the units above, for a manifest."""
         return asdict(self)

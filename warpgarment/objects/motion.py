@@ -1,4 +1,4 @@
-"""A garment in motion: what a rollout returns."""
+"""A garment in motion, the result of a rollout."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from .status import RolloutStatus, Verdict
 
 
 class GarmentMotion:
-    """Positions of a garment over time, with one status a frame.
+    """Positions of a garment over time, with one status per frame.
 
     Attributes:
-        vertices: Positions [m], Y up, float32, shape [T,V,3]. A rollout that went wrong may hold NaN: see `status`.
-        faces: int32, shape [F,3].
+        vertices: Positions [m], Y up, float32, shape [T,V,3]. A rollout that failed may hold NaN; see `status`.
+        faces: Vertex indices, int32, shape [F,3].
         fps: Frames per second.
-        status: One `RolloutStatus` a frame, or empty where there was no simulation.
-        name: For messages and file names.
+        status: One `RolloutStatus` per frame, or empty if the motion was not simulated.
+        name: Name of the garment, for messages and file names.
 
     Raises:
-        MeshError: Shapes that do not fit, indices out of range, or as many statuses as there are not frames.
+        MeshError: Shapes do not fit each other, an index is out of range, or the number of statuses is neither zero
+            nor the number of frames.
     """
 
     def __init__(
@@ -56,18 +57,18 @@ class GarmentMotion:
         """Writes the motion, completely or not at all.
 
         - ``.npz``: positions, faces, rate, status and name; `load` reads all formats, this one without loss;
-        - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample a frame (extra ``usd``), Y up, metres;
-        - ``.pc2``: Blender's and others' point cache, with the first frame as ``.obj`` of the same name beside it;
+        - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres;
+        - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it;
         - no suffix: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is replaced if it
           holds nothing else.
 
         Args:
-            path: Where to; parent folders are made.
+            path: File or folder to write; parent folders are made.
 
         Raises:
-            ValueError: Another suffix.
+            ValueError: The suffix is not one of these.
             FileExistsError: The folder holds files that are not frames.
-            MissingExtra: USD without ``pip install "warpgarment[usd]"``.
+            MissingExtra: The format is USD and the extra is not installed (``pip install "warpgarment[usd]"``).
         """
         from warpgarment.io.sequence import write_sequence
 

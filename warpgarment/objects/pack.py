@@ -1,8 +1,7 @@
-"""Packs garments and bodies end to end, and lays the packed faces out in padded rows for the network.
+"""Garments and bodies packed end to end.
 
-Packed arrays hold all garments one after another; faces hold global vertex indices. A row of a padded view is one
-garment, or one of its `face_splits` interleaved subsets of faces (section 4.3). Rows of similar length share a view, so
-little is padded, and a batch of one garment many times shares its geodesic weights.
+Packed arrays hold all garments one after another; faces hold global vertex indices. The padded rows that a network
+reads are made from them in `nn/rows.py`.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from .garment import Garment
 
 @dataclasses.dataclass(frozen=True)
 class PackedGarments:
-    """Garments end to end. Offsets are host integers of length B+1; the rest are tensors on the device."""
+    """Garments end to end. Offsets are host integers [B+1]; all other fields are tensors on the device."""
 
-    rest_vertices: torch.Tensor  # [V,3]
-    faces: torch.Tensor  # int32 [F,3]
+    rest_vertices: torch.Tensor  # float32 [V,3], positions [m]
+    faces: torch.Tensor  # int32 [F,3], global vertex indices
     garment_of_vertex: torch.Tensor  # int32 [V]
     garment_of_face: torch.Tensor  # int32 [F]
     vertex_component: torch.Tensor  # int32 [V]
@@ -36,7 +35,7 @@ class PackedGarments:
 
     @classmethod
     def pack(cls, garments: Sequence[Garment], device: torch.device) -> PackedGarments:
-        """Packs garments in the order given."""
+        """Packs garments in their order in the sequence, as tensors on a device."""
         vertex_component: list[np.ndarray] = []
         face_component: list[np.ndarray] = []
         counts: list[int] = []
@@ -78,13 +77,13 @@ class PackedGarments:
         return self.component_offsets[-1]
 
     def split(self, vertices: np.ndarray) -> list[np.ndarray]:
-        """Packed positions [...,V,3] as one array per garment."""
+        """Splits packed positions [...,V,3] into one array per garment."""
         return np.split(vertices, self.vertex_offsets[1:-1], axis=-2)
 
 
 @dataclasses.dataclass(frozen=True)
 class PackedBodies:
-    """Topology of bodies end to end, and which garment is on which."""
+    """Faces of bodies end to end, and the body of each garment. Offsets are host integers [number of bodies + 1]."""
 
     faces: torch.Tensor  # int32 [G,3], global vertex indices
     vertex_offsets: tuple[int, ...]
@@ -99,13 +98,13 @@ class PackedBodies:
         body_of_garment: Sequence[int],
         device: torch.device,
     ) -> PackedBodies:
-        """Packs bodies in the order given.
+        """Packs bodies in their order in the sequence.
 
         Args:
-            faces: Of each body, shape [G,3].
-            vertex_counts: Of each body.
-            body_of_garment: Index of the body each garment is on.
-            device: Where the tensors go.
+            faces: Faces of each body as its own vertex indices, shape [G,3].
+            vertex_counts: Number of vertices of each body.
+            body_of_garment: Index of the body of each garment, length B.
+            device: Device of the tensors.
         """
         offsets = _offsets(vertex_counts)
         packed = np.concatenate([np.asarray(f) + start for f, start in zip(faces, offsets, strict=False)])
@@ -122,6 +121,6 @@ def _offsets(counts: Sequence[int]) -> tuple[int, ...]:
 
 
 def _owner(offsets: Sequence[int], device: torch.device) -> torch.Tensor:
-    """Which of the packed things each element belongs to; offsets [B+1] -> int32 [offsets[-1]]."""
+    """Index of the garment or body to which each packed element belongs, int32 [offsets[-1]]; offsets are [B+1]."""
     counts = torch.tensor(np.diff(offsets))
     return torch.repeat_interleave(torch.arange(len(counts)), counts).to(device, torch.int32)

@@ -1,4 +1,4 @@
-"""How a frame of a rollout turned out, in terms a user can act on."""
+"""The outcome of a frame of a rollout, in terms a user can act on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PENETRATION_TOLERANCE = 0.01
 
 
 class Verdict(enum.Enum):
-    """What is to be said about a frame; `message` names the remedy."""
+    """Judgement on a frame; `message` names the remedy."""
 
     OK = "ok"
     PENETRATING = "penetrating"
@@ -18,7 +18,7 @@ class Verdict(enum.Enum):
 
     @property
     def message(self) -> str:
-        """One sentence for the user."""
+        """One or two sentences for the user."""
         return _MESSAGES[self]
 
 
@@ -37,17 +37,18 @@ _MESSAGES = {
 
 @dataclass(frozen=True)
 class RolloutStatus:
-    """One frame's outcome.
+    """The outcome of one frame.
 
     Attributes:
         frame: Index in the motion, from 0.
         finite: Whether every position is finite.
-        max_penetration: Depth of the garment's deepest point below the body's surface [m], at least 0: of its
-            vertices, and of points of its edges and faces, see `kernels.surface_depth`.
-        poisson_iterations: Conjugate gradient iterations of the Poisson solve, the largest of all components; 0 where
-            it was solved directly.
-        collision_iterations: The same of the collision refinement.
-        verdict: What follows from these.
+        max_penetration: Depth of the garment's deepest point below the body's surface [m], at least 0. Points are its
+            vertices, and points of its edges and faces; see `warpgarment.kernels.sdf.surface_depth`.
+        poisson_iterations: Number of conjugate gradient iterations of the Poisson solve, the largest of all
+            components; 0 if it was solved directly.
+        collision_iterations: Number of conjugate gradient iterations of the collision refinement, the largest of all
+            components, summed over the passes.
+        verdict: Judgement that follows from these figures.
     """
 
     frame: int
@@ -68,7 +69,7 @@ class RolloutStatus:
         *,
         tolerance: float = PENETRATION_TOLERANCE,
     ) -> RolloutStatus:
-        """A status whose verdict follows from the figures; `tolerance` is the depth [m] that is still fine."""
+        """A status whose verdict follows from its figures; `tolerance` is the largest acceptable depth [m]."""
         if not finite:
             verdict = Verdict.NOT_FINITE
         else:
@@ -77,5 +78,5 @@ class RolloutStatus:
 
     @property
     def message(self) -> str:
-        """The verdict's sentence, with the frame it is about."""
+        """The message of the verdict, with the number of the frame."""
         return f"Frame {self.frame}: {self.verdict.message}"

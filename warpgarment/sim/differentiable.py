@@ -1,6 +1,6 @@
 """The geometry of a frame with gradients: what `Scene` does in fused launches without them, operator by operator.
 
-Training through several frames (`training/unroll.py`) needs them. Values are the same up to rounding.
+Training through several frames (`training/train/unrolled_objective.py`) needs them. Values are the same up to rounding.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Simulator:
         collision_passes: Collision refinement is repeated while anything of a garment is more than 0.1 mm deep, at most
             so often per frame; 0 leaves it out.
         half: Run the transformer in bfloat16: faster on recent GPUs. Geometry stays in float32.
-        graph: Replay frames as one CUDA graph, after the first few (`frame_graph.py`). None: on CUDA, and a graph that
+        graph: Replay frames as one CUDA graph, after the first few (`graph.py`). None: on CUDA, and a graph that
             cannot be made is a RuntimeWarning. Off while `timings.synchronise` is set, which measures inside a frame.
 
     Attributes:

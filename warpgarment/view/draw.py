@@ -1,4 +1,4 @@
-"""Pictures and films of bodies and garments, drawn by Warp kernels: no display, no driver, the same on every machine.
+"""Pictures and films of bodies and garments, drawn by Warp kernels, which need neither display nor graphics driver.
 
     image = draw.render([draw.Surface(body, body_faces), draw.Surface(dress, faces, draw.CORAL, lining=True)])
     draw.write_png("dress.png", image)
@@ -50,7 +50,7 @@ Motion: TypeAlias = "BodyMotion | GarmentMotion"
 
 @dataclass(frozen=True)
 class Surface:
-    """One mesh to draw: `vertices` [V, 3] in metres, `faces` [F, 3]; `lining`: the backs of faces are darker."""
+    """One mesh to draw: `vertices` [m], [V, 3], and `faces`, [F, 3]; with `lining`, the backs of faces are darker."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -78,7 +78,14 @@ class Camera:
     def framing(
         cls, vertices: np.ndarray, *, size: tuple[int, int] = (640, 640), azimuth: float = 28.0, elevation: float = 9.0
     ) -> Camera:
-        """A camera that sees all of `vertices` [..., 3] in a picture of `size` (width, height)."""
+        """A camera that sees all vertices.
+
+        Args:
+            vertices: Positions [m], [..., 3].
+            size: Width and height of the picture in pixels.
+            azimuth: Direction of the camera around the vertical axis [degrees].
+            elevation: Height of the camera's direction above the horizon [degrees].
+        """
         points = np.asarray(vertices, dtype=np.float64).reshape(-1, 3)
         low, high = points.min(0), points.max(0)
         camera = cls(tuple((low + high) / 2), 1.0, azimuth, elevation)
@@ -91,7 +98,7 @@ class Camera:
         return replace(camera, distance=float(1.05 * max(needed.max(), 1e-3)))
 
     def axes(self) -> np.ndarray:
-        """Rows right, up, forward."""
+        """Unit vectors of the camera as rows: right, up, forward, shape [3, 3]."""
         forward = -self.direction
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
@@ -119,15 +126,15 @@ def render(
     """Draws surfaces in one picture.
 
     Args:
-        surfaces: What to draw. Vertices that are not finite take their faces out of the picture.
-        camera: Where to look from; by default it frames everything.
+        surfaces: Surfaces to draw. Faces with a vertex that is not finite are left out.
+        camera: Camera of the picture; None frames all surfaces.
         size: Width and height in pixels.
-        samples: Samples a pixel in each direction.
-        floor: Height of the floor [m]; None for none.
-        device: Warp device to draw on.
+        samples: Number of samples per pixel in each direction.
+        floor: Height of the floor [m]; None for no floor.
+        device: Warp device on which the picture is drawn.
 
     Returns:
-        uint8 [height, width, 3].
+        sRGB picture, uint8 [height, width, 3].
     """
     from warpgarment.kernels.render import raster, shading
 
@@ -198,14 +205,20 @@ def _lighting(camera: Camera, seen: np.ndarray, floor: float | None) -> tuple[An
 
 
 def _vec3(values: Iterable[float]) -> wp.vec3:
-    """Three numbers as a Warp struct keeps them."""
+    """Three numbers as a Warp vector."""
     import warp as wp
 
     return wp.vec3(*values)
 
 
 def chase(motions: Sequence[Motion], *, size: tuple[int, int], azimuth: float = 28.0) -> Camera:
-    """A camera that keeps all motions in the picture while it follows the first; `target` is relative to that one."""
+    """A camera that keeps all motions in the picture while it follows the first; `target` is relative to the first.
+
+    Args:
+        motions: Motions to show; the first one is followed.
+        size: Width and height of the picture in pixels.
+        azimuth: Direction of the camera around the vertical axis [degrees].
+    """
     frames = range(0, motions[0].frames, max(1, motions[0].frames // 12))
     middle = _middle(motions[0])
     around = np.concatenate([m.vertices[min(t, m.frames - 1)] - middle[t] for m in motions for t in frames])
@@ -223,10 +236,20 @@ def film(
     camera: Camera | None = None,
     device: str = "cpu",
 ) -> Iterator[np.ndarray]:
-    """Pictures of a motion, one after another; the camera follows the body, or the first garment.
+    """Pictures of a motion, one after another; the camera follows the body, or the first garment if there is no body.
+
+    Args:
+        body: Body to draw; None for none.
+        garments: Garments to draw.
+        size: Width and height in pixels.
+        colors: Colours of the garments, in their order.
+        frames: Indices of the frames to draw; None for all.
+        samples: Number of samples per pixel in each direction.
+        camera: Camera whose target is relative to the motion it follows; None frames everything.
+        device: Warp device on which the pictures are drawn.
 
     Yields:
-        uint8 [height, width, 3] for every frame in `frames` (all by default).
+        sRGB picture of each frame, uint8 [height, width, 3].
     """
     motions: list[Motion] = [*([body] if body is not None else []), *garments]
     camera = camera or chase(motions, size=size)
@@ -243,16 +266,16 @@ def film(
         return render(surfaces, there, size=size, floor=floor, samples=samples, device=device)
 
     wanted = list(range(motions[0].frames) if frames is None else frames)
-    yield from map(picture, wanted[:1])  # alone: it may have to compile the kernels
+    yield from map(picture, wanted[:1])  # before the others, since it may have to compile the kernels
     with ThreadPoolExecutor(
         os.cpu_count() if device == "cpu" else 1
-    ) as pool:  # launches release the interpreter's lock
+    ) as pool:  # launches release the global interpreter lock
         for start in range(1, len(wanted), 16):
             yield from pool.map(picture, wanted[start : start + 16])
 
 
 Row = tuple[str, "Sequence[GarmentMotion]", "Sequence[Color]"]
-"""One row of a sheet: its title, what is worn, and in which colours."""
+"""One row of a sheet: its title, its garments, and their colours."""
 
 
 def sheet(
@@ -265,10 +288,19 @@ def sheet(
     camera: Camera | None = None,
     device: str = "cpu",
 ) -> np.ndarray:
-    """Writes a PNG with one row of evenly spaced moments for each of `rows`, all seen by the same camera.
+    """Writes a PNG with one row of evenly spaced frames for each of `rows`, all drawn with the same camera.
+
+    Args:
+        path: File to write.
+        body: Body to draw in every row; None for none.
+        rows: Rows from top to bottom.
+        frames: Number of frames in a row.
+        size: Width and height of each frame in pixels.
+        camera: Camera of all frames, as in `film`; None frames everything.
+        device: Warp device on which the pictures are drawn.
 
     Returns:
-        The picture, uint8 [H, W, 3].
+        sRGB picture, uint8 [H, W, 3].
     """
     timed: Motion = body if body is not None else rows[0][1][0]
     moments = np.unique(np.linspace(0, timed.frames - 1, frames).round().astype(int))
@@ -293,10 +325,19 @@ def contact_sheet(
     size: tuple[int, int] = (240, 340),
     device: str = "cpu",
 ) -> np.ndarray:
-    """Writes a sheet with a row per garment and, below each, one of its ground truth where there is one.
+    """Writes a sheet with one row per garment and, below it, one row of its ground truth if that is given.
+
+    Args:
+        path: File to write.
+        body: Body to draw in every row.
+        garments: Garments, one row each.
+        truth: Ground truth of each garment, or None for a garment that has none.
+        frames: Number of frames in a row.
+        size: Width and height of each frame in pixels.
+        device: Warp device on which the pictures are drawn.
 
     Returns:
-        The picture, uint8 [H, W, 3].
+        sRGB picture, uint8 [H, W, 3].
     """
     rows: list[Row] = []
     references = list(truth) if truth is not None else [None] * len(garments)
@@ -310,7 +351,7 @@ def contact_sheet(
 
 
 def _middle(motion: Motion, width: int = 9) -> np.ndarray:
-    """Centre of the bounding box [T, 3], averaged over `width` frames: the camera glides over the bobbing of steps."""
+    """Centre of the bounding box [m], [T, 3], averaged over `width` frames to smooth out steps."""
     vertices = np.nan_to_num(motion.vertices)
     centre = (vertices.min(1) + vertices.max(1)) / 2
     padded = np.pad(centre, ((width // 2, width // 2), (0, 0)), mode="reflect", reflect_type="odd")

@@ -1,4 +1,4 @@
-"""Writing pictures: PNG, MP4, captions. Needs the extra `view`; files appear complete or not at all."""
+"""Writing pictures: PNG, MP4, captions. Needs the extra `view`; files are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ INK, MUTED = "#2f3640", "#77808c"
 
 
 def caption(image: np.ndarray, text: str) -> np.ndarray:
-    """The picture with small grey text in its lower left corner."""
+    """The picture, uint8 [H, W, 3], with small grey text in its lower left corner."""
     size = max(11, image.shape[0] // 26)
     return _written(image, text, (size // 2, image.shape[0] - size - size // 2), size, MUTED)
 
 
 def titled(image: np.ndarray, text: str, size: int = 15) -> np.ndarray:
-    """The picture below a band with a line of text."""
+    """The picture, uint8 [H, W, 3], below a band with one line of text; `size` is that of the letters in pixels."""
     band = np.full((2 * size, image.shape[1], 3), 255, dtype=np.uint8)
     return np.concatenate([_written(band, text, (size // 2, size // 2 - 1), size, INK), image])
 
@@ -35,12 +35,12 @@ def _written(image: np.ndarray, text: str, corner: tuple[int, int], size: int, c
 
 
 def write_png(path: str | Path, image: np.ndarray, *, colors: int | None = None) -> None:
-    """Writes uint8 [H, W, 3]; the file appears complete or not at all.
+    """Writes a picture as PNG, completely or not at all.
 
     Args:
-        path: Of the file.
-        image: The picture.
-        colors: Size of the palette, at most 256, which makes the file three times smaller; None: all colours are kept.
+        path: File to write.
+        image: sRGB picture, uint8 [H, W, 3].
+        colors: Size of the palette, at most 256, which makes the file three times smaller; None keeps all colours.
     """
     with _needs_view():
         import imageio.v3 as iio
@@ -53,14 +53,23 @@ def write_png(path: str | Path, image: np.ndarray, *, colors: int | None = None)
 
 
 def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float = 30.0) -> int:
-    """Writes pictures, uint8 [H, W, 3] of one size, as an H.264 film that browsers play; returns how many."""
+    """Writes pictures as an H.264 film that browsers play.
+
+    Args:
+        path: File to write.
+        frames: sRGB pictures of one size, uint8 [H, W, 3].
+        fps: Frames per second.
+
+    Returns:
+        Number of pictures.
+    """
     with _needs_view():
         import imageio_ffmpeg
     count, sink = 0, None
     with atomic_file(Path(path)) as temporary:
         try:
             for image in frames:
-                height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2  # 4:2:0 needs even numbers
+                height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2  # 4:2:0 needs even sizes
                 image = np.ascontiguousarray(image[:height, :width])
                 if sink is None:
                     sink = imageio_ffmpeg.write_frames(

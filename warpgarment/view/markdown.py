@@ -7,12 +7,12 @@ from typing import Any
 
 
 def table(header: Sequence[Any], rows: Iterable[Sequence[Any]], text: int | Collection[str] = 1) -> list[str]:
-    """Lines of a table; columns of numbers are aligned to the right.
+    """Lines of a Markdown table in which columns of numbers are aligned to the right.
 
     Args:
         header: Headings of the columns.
-        rows: Cells of each row, one for each heading; written by `str`.
-        text: Columns aligned to the left: the number of leading ones, or their headings.
+        rows: Cells of each row, one per heading; they are converted by `str`.
+        text: Columns of text, which are aligned to the left: the number of leading columns, or their headings.
 
     Raises:
         ValueError: A row has another number of cells than the header.

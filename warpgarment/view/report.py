@@ -1,4 +1,4 @@
-"""Tables in the terminal: how a rollout went and where its time went."""
+"""Tables for the terminal: the outcome of rollouts, and the time spent in each stage."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STAGES = ("features", "network", "singular values", "poisson", "collision")
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Plain text, first column left, the others right."""
+    """A table as plain text, with the first column aligned to the left and the others to the right."""
     cells = [[str(c) for c in row] for row in (header, *rows)]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     lines = [
@@ -28,15 +28,15 @@ def rollout_table(
     timings: Mapping[str, Mapping[str, float]],
     errors: Mapping[str, float] | None = None,
 ) -> str:
-    """A column per garment: frames, milliseconds a frame by stage, error against the ground truth, deepest penetration.
+    """A table with one column per garment: frames, milliseconds per frame in each stage, error, deepest penetration.
 
     Args:
-        motions: Results of rollouts, by name.
-        timings: `Simulator.timings` after each: seconds spent in each stage, all frames together.
-        errors: Mean vertex error [cm] by name, where there is a ground truth.
+        motions: Results of rollouts by name.
+        timings: `Simulator.timings` after each rollout by name: time in each stage over all frames [s].
+        errors: Mean vertex error against the ground truth by name [cm], for garments that have one.
 
     Returns:
-        Text of several lines; the last ones say, for every garment that did not go well, what to do.
+        Text of several lines; the last ones name the remedy for every garment whose rollout failed.
     """
     names = list(motions)
     rows: list[list[object]] = [["faces", *(f"{len(motions[n].faces):,}" for n in names)]]
@@ -61,5 +61,5 @@ def rollout_table(
 
 
 def deepest(motion: GarmentMotion) -> float:
-    """Largest penetration over all frames [m]; 0 where there is no status."""
+    """Largest penetration over all frames [m]; 0 for a motion without status."""
     return float(np.max([s.max_penetration for s in motion.status], initial=0.0))

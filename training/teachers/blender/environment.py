@@ -1,9 +1,9 @@
-"""The Python that runs Blender: found where it is, made on request.
+"""The Python that runs Blender: an existing one is detected, a new one is made on request.
 
     python -m warpgarment.training.teachers.blender.environment [--path DIR] [--python python3.11]
 
 `bpy` is Blender as a Python module. It is GPL, needs NumPy 1 and one exact version of Python, so it lives in a virtual
-environment of its own and is only ever run as a subprocess. $WARPGARMENT_BLENDER names another Python that has it.
+environment of its own and is only ever run as a subprocess. $WARPGARMENT_BLENDER names another Python with `bpy`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ COMMAND = "python -m warpgarment.training.teachers.blender.environment"
 
 
 def default_folder() -> Path:
-    """Where the environment is made unless another folder is named."""
+    """The folder in which the environment is made unless another one is given."""
     return cache_folder() / "blender"
 
 
@@ -39,7 +39,8 @@ def find_environment(named: str | Path | None = None) -> Path:
     """The Python that has bpy.
 
     Args:
-        named: A virtual environment or a Python; by default $WARPGARMENT_BLENDER, else the one in the default folder.
+        named: Virtual environment or Python; None for $WARPGARMENT_BLENDER if that is set, otherwise for the
+            environment in the default folder.
 
     Raises:
         TeacherError: There is none; the message names the command that makes one.
@@ -56,10 +57,10 @@ def find_environment(named: str | Path | None = None) -> Path:
 
 @lru_cache(maxsize=8)
 def version_of(python: Path) -> str:
-    """The version of bpy that a Python has.
+    """The version of bpy in a Python.
 
     Raises:
-        TeacherError: It has none.
+        TeacherError: The Python has no bpy.
     """
     ask = "import importlib.metadata as m; print(m.version('bpy'))"
     answer = subprocess.run([python, "-I", "-c", ask], capture_output=True, text=True, check=False)
@@ -69,15 +70,15 @@ def version_of(python: Path) -> str:
 
 
 def make_environment(path: str | Path | None = None, python: str | Path | None = None) -> Path:
-    """Makes the virtual environment with bpy; one that is there and works is left alone.
+    """Makes the virtual environment with bpy; an existing one that works is not changed.
 
     Args:
-        path: Its folder; by default one in the cache folder, where :func:`find_environment` looks.
-        python: The Python to make it with, of the version that bpy was built for; by default this one if it is, else
-            `python3.11`.
+        path: Folder of the environment; None for the one in the cache folder that :func:`find_environment` reads.
+        python: Python that makes the environment, of the version for which bpy was built; None for the running one if
+            it has this version, otherwise for `python3.11`.
 
     Returns:
-        The environment's Python.
+        Path of the environment's Python.
 
     Raises:
         TeacherError: The folder holds something else, the Python is of another version, or an installation failed.
@@ -112,25 +113,25 @@ def _default_python() -> str:
 
 
 def _checked_python(python: str) -> str:
-    """The Python's path, if it has the version that bpy needs."""
-    found = shutil.which(python)
-    if found is None:
+    """Path of a Python after a check that it has the version that bpy needs."""
+    path = shutil.which(python)
+    if path is None:
         raise TeacherError(
             f"{PACKAGES[0]} needs Python {PYTHON_VERSION}, and there is no {python}. Install it, or name one: "
             f"`{COMMAND} --python /path/to/python{PYTHON_VERSION}`."
         )
     ask = "import sys; print('%d.%d' % sys.version_info[:2])"
-    version = subprocess.run([found, "-c", ask], capture_output=True, text=True, check=False).stdout.strip()
+    version = subprocess.run([path, "-c", ask], capture_output=True, text=True, check=False).stdout.strip()
     if version != PYTHON_VERSION:
         raise TeacherError(
             f"{PACKAGES[0]} needs Python {PYTHON_VERSION}; {python} is {version or 'no Python'}. "
             f"Name another: `{COMMAND} --python python{PYTHON_VERSION}`."
         )
-    return found
+    return path
 
 
 def _failure(command: list) -> str:
-    """What a command wrote last if it failed, or nothing."""
+    """The last output of a command if it failed, otherwise an empty text."""
     answer = subprocess.run(command, capture_output=True, text=True, check=False)
     return (answer.stderr or answer.stdout)[-2000:] or "no message" if answer.returncode else ""
 

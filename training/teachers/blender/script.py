@@ -1,15 +1,15 @@
-"""Simulates one scene with Blender's cloth: run by Blender's own Python, `python blender_script.py FOLDER`.
+"""Simulates one scene with Blender's cloth: run by Blender's own Python, `python script.py FOLDER`.
 
-Needs bpy and numpy and nothing of this package, so that neither meets the other's licence or versions. FOLDER holds
+The script needs bpy and numpy and nothing of this package, so that licences and versions stay separate. FOLDER holds
 
-    scene.json   Blender's numbers, already converted (see :mod:`.blender`)
-    scene.npz    faces, start, rest, structural, bending, pins; body_faces, body_first and wind where there are any
+    scene.json   Blender's numbers, already converted (see `units.py`)
+    scene.npz    faces, start, rest, structural, bending, pins; body_faces, body_first and wind if there are any
     body.pc2     the body, one sample for every Blender frame from 1 on
-    pins.pc2     the pinned vertices' way, in the same frames
+    pins.pc2     the path of the pinned vertices, in these frames
 
-all of it Z up and in Blender's unit of length. What comes back on the standard output is binary: a line with the magic
-word, then for each frame its size in bytes (4 bytes, little endian) and its vertices (float32), and at the end a size
-of zero. Everything Blender itself prints goes to the standard error.
+with Z up and in Blender's unit of length. The result on the standard output is binary: a line with the magic word, then
+for each frame its size in bytes (4 bytes, little endian) and its vertices (float32), and at the end a size of zero. The
+output of Blender itself goes to the standard error.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ MAGIC = b"warpgarment-frames 1\n"
 
 
 def own_output() -> IO[bytes]:
-    """The standard output for frames alone; whatever else is printed, by C code too, goes to the standard error."""
-    mine = os.dup(1)
+    """A stream to the standard output, for frames alone; other output, also of C code, goes to the standard error."""
+    own = os.dup(1)
     os.dup2(2, 1)
-    return os.fdopen(mine, "wb")
+    return os.fdopen(own, "wb")
 
 
 @contextlib.contextmanager
 def few_processors(count: int) -> Iterator[None]:
-    """Holds this process to so many processors, where the system can; 0 for all."""
+    """Limits this process to a number of processors if the system can; 0 stands for all."""
     allowed = os.sched_getaffinity(0) if count and hasattr(os, "sched_setaffinity") else None
     if allowed:
         os.sched_setaffinity(0, sorted(allowed)[:count])
@@ -49,10 +49,10 @@ def few_processors(count: int) -> Iterator[None]:
 
 
 def simulate(folder: Path, sink: IO[bytes]) -> None:
-    """Builds the scene in `folder` and writes its frames to `sink` as they come."""
+    """Builds the scene of a folder and writes its frames to a stream as they are simulated."""
     numbers = json.loads((folder / "scene.json").read_text())
     with few_processors(numbers["threads"]):
-        import bpy  # counts the processors it may use, once
+        import bpy  # counts the available processors once, at import
     import numpy as np
 
     with np.load(folder / "scene.npz", allow_pickle=False) as data:
@@ -85,7 +85,7 @@ def simulate(folder: Path, sink: IO[bytes]) -> None:
 
 
 def add_mesh(bpy: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """An object with a triangle mesh, in the scene."""
+    """Adds an object with a triangle mesh to the scene; vertices are [V, 3], faces [F, 3]."""
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(vertices.tolist(), [], faces.tolist())
     mesh.update()
@@ -95,13 +95,13 @@ def add_mesh(bpy: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> An
 
 
 def follow(thing: Any, path: Path) -> None:
-    """Lets a mesh take its vertices from a PC2 file whose first sample is frame 1."""
+    """Makes a mesh take its vertices from a PC2 file whose first sample is frame 1."""
     cache = thing.modifiers.new("path", "MESH_CACHE")
     cache.cache_format, cache.filepath, cache.frame_start = "PC2", str(path), 1.0
 
 
 def add_body(bpy: Any, folder: Path, arrays: dict[str, np.ndarray], numbers: dict[str, Any]) -> None:
-    """The body: a mesh that follows its path and that cloth collides with, from outside only."""
+    """Adds the body, a mesh that follows its path and with which cloth collides from outside only."""
     body = add_mesh(bpy, "body", arrays["body_first"], arrays["body_faces"])
     follow(body, folder / "body.pc2")
     body.modifiers.new("collision", "COLLISION")
@@ -110,7 +110,7 @@ def add_body(bpy: Any, folder: Path, arrays: dict[str, np.ndarray], numbers: dic
 
 
 def add_wind(bpy: Any, wind: np.ndarray) -> None:
-    """A wind along its own Z axis; rows are a unit direction, a strength and an air flow, one for every frame."""
+    """Adds a wind along its own Z axis; each row [5] has a unit direction, strength and air flow, one row per frame."""
     from mathutils import Vector
 
     bpy.ops.object.effector_add(type="WIND")
@@ -125,7 +125,7 @@ def add_wind(bpy: Any, wind: np.ndarray) -> None:
 
 
 def add_cloth(bpy: Any, folder: Path, arrays: dict[str, np.ndarray], numbers: dict[str, Any]) -> Any:
-    """All garments as one cloth, so that they collide with each other as a cloth does with itself."""
+    """Adds all garments as one cloth, so that they collide with each other as a cloth does with itself."""
     cloth = add_mesh(bpy, "cloth", arrays["start"], arrays["faces"])
     for name in ("structural", "bending"):
         group = cloth.vertex_groups.new(name=name)

@@ -1,8 +1,8 @@
 """Blender's cloth as a teacher: a subprocess with `bpy`, in an environment of its own, that sends its frames back.
 
 All cloths of a scene become one mesh, so that layers collide as a cloth does with itself; D-LAYERS was made that way.
-What a scene says in SI is converted to Blender's numbers in :mod:`.blender_units`, which also says what Blender cannot
-express.
+The SI quantities of a scene are converted to Blender's numbers in `units.py`, whose docstring also lists what Blender
+cannot express.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from .units import BlenderSettings, blender_numbers, pin_path, to_y_up, to_z_up
 
 SCRIPT = Path(__file__).with_name("script.py")
 MAGIC = b"warpgarment-frames 1\n"
-LAST_WORDS = 2000  # characters of what a Blender that died had to say
+LAST_WORDS = 2000  # number of characters of Blender's last output that an error quotes
 
 
 class BlenderTeacher:
     """Simulates cloth with Blender.
 
     Args:
-        settings: Of the simulation.
-        environment: The virtual environment that has bpy, or its Python; by default what
-            :func:`.blender_environment.find_environment` finds.
-        script: What it runs.
+        settings: Settings of the simulation; None for the defaults.
+        environment: Virtual environment with bpy, or its Python; None for the result of
+            :func:`.environment.find_environment`.
+        script: Script that Blender's Python runs.
 
     Raises:
-        TeacherError: There is no such Python; the message says how to make one.
+        TeacherError: There is no such Python; the message names the command that makes one.
     """
 
     name = "blender"
@@ -62,7 +62,7 @@ class BlenderTeacher:
         return {"teacher": self.name, "bpy": version_of(self._python), **asdict(self._settings)}
 
     def simulate(self, scene: ClothScene) -> Iterator[np.ndarray]:
-        """Yields T frames, float32 [V, 3], Y up; see :class:`.Teacher`. Leaving the loop ends Blender."""
+        """Yields T frames [m], float32 [V, 3], Y up; see :class:`.Teacher`. Leaving the loop ends Blender."""
         with self._running(scene) as frames:
             yield from frames
 
@@ -75,7 +75,7 @@ class BlenderTeacher:
 
     @contextlib.contextmanager
     def _running(self, scene: ClothScene) -> Iterator[Iterator[np.ndarray]]:
-        """The frames of a scene, from a Blender that ends, and whose files go, with the block."""
+        """Context with the frames of a scene; at its end, Blender is stopped and its files are removed."""
         check_scenes([scene])
         with tempfile.TemporaryDirectory(prefix="warpgarment-blender-") as name:
             folder = Path(name)
@@ -102,7 +102,13 @@ class BlenderTeacher:
 
 
 def write_scene(folder: Path, scene: ClothScene, settings: BlenderSettings) -> None:
-    """Writes what the script reads: scene.json, scene.npz, body.pc2 and pins.pc2; see :mod:`.blender_script`."""
+    """Writes the files that the script reads: scene.json, scene.npz, body.pc2 and pins.pc2; see `script.py`.
+
+    Args:
+        folder: Folder of the files.
+        scene: Scene to simulate.
+        settings: Settings of the simulation.
+    """
     numbers, arrays = blender_numbers(scene, settings)
     first = np.concatenate([cloth.first for cloth in scene.cloths])
     body, body_faces = used_body(scene)
@@ -110,7 +116,7 @@ def write_scene(folder: Path, scene: ClothScene, settings: BlenderSettings) -> N
     def placed(points: np.ndarray) -> np.ndarray:
         return (to_z_up(points.astype(np.float64)) * settings.scale).astype(np.float32)
 
-    def write_path(name: str, frames: np.ndarray) -> None:  # Blender's frame 1 and those of settling are the first
+    def write_path(name: str, frames: np.ndarray) -> None:  # the first frame is held while the cloth settles
         held = np.repeat(frames[:1], scene.settle + 1, axis=0)
         write_pc2_to(folder / name, np.concatenate([held, frames]), start=1.0)
 

@@ -1,8 +1,9 @@
 """A cloth scene in Blender's numbers.
 
-Blender's cloth counts time in frames and has its own scale for every setting. They follow from its equations, as its
-source has them and as measured (a free fall, hanging strips, a sheet pushed by the wind), with S of Blender's units of
-length to the metre, f frames a second, k the ratio of Blender's mass of a vertex to its mass in kg:
+Blender's cloth counts time in frames and has its own scale for every setting. The scales follow from the equations in
+its source and were confirmed by measurements (a free fall, hanging strips, a sheet pushed by the wind), with S of
+Blender's units of length per metre, f frames per second, and k the ratio of Blender's mass of a vertex to its mass in
+kg:
 
     gravity      0.001 G per frame^2                    G = 1000 g S / f^2
     spring       T / (mean edge) per length             T = K k S (mean edge) / f^2,  K [N/m] a spring's stiffness
@@ -10,16 +11,16 @@ length to the metre, f frames a second, k the ratio of Blender's mass of a verte
     bending      moment of a hinge 0.1 b L h / 3        b = 30 B k / (h f^2),         B [N] moment per angle and length
     air          0.02 A (s/f - F v) along the normal    see :func:`air`
 
-(L a hinge's length, h the height of its triangles, A a face's area, v a velocity per frame.)
+L is a hinge's length, h the height of its triangles, A a face's area, and v a velocity per frame.
 
-What Blender cannot do: springs along edges make a sheet with Poisson's ratio 1/3, so there is no shear stiffness to
-choose (Blender has one for quadrilaterals only), and :attr:`.Material.modulus` is what counts; mass is the same for all
-vertices, friction for all cloths. Stiffness is therefore multiplied by each cloth's own ratio k. Gravity, inertia,
-stretch and bending of every cloth then are in the proportion that its material asks for; what is left of the common
-mass is how hard one cloth pushes another, and how much the air moves it. Borders weigh twice what is theirs.
+Blender has these limits: springs along edges make a sheet with Poisson's ratio 1/3, so there is no free shear stiffness
+(Blender has one for quadrilaterals only), and only :attr:`.Material.modulus` counts; all vertices have one mass and all
+cloths one friction. Stiffness is therefore multiplied by each cloth's own ratio k. Gravity, inertia, stretch and
+bending of every cloth then have the proportions of its material; the common mass only affects how hard one cloth pushes
+another, and how much the air moves it. Vertices of borders have twice the mass of their share of the area.
 
-Lengths are scaled up because Blender has constants: it drops contacts closer than 0.35 mm of its metre, and takes
-triangles with edges below 20 mm for points when it spreads an impulse over their corners.
+Lengths are scaled up because of constants in Blender: it drops contacts closer than 0.35 mm in its unit of length, and
+treats triangles with edges below 20 mm as points when it spreads an impulse over their corners.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from warpgarment.kernels.wind import DRAG
 from warpgarment.training.teachers import Cloth, ClothScene
 from warpgarment.training.teachers.scenes import bound_to_body
 
-AIR_DENSITY = 1.225  # kg/m^3
-STIFFEST = 1000.0  # Blender's number for what is stiffest, of 10,000 at most; the mass of a vertex follows from it
+AIR_DENSITY = 1.225  # density of air at sea level [kg/m^3]
+STIFFEST = 1000.0  # Blender's number for the stiffest cloth, at most 10,000; the mass of a vertex follows from it
 STEADY = 4.0  # bending / (mass substeps^2) at which cloth stays calm: Blender's bending is explicit; at 15 it trembled
 MOST_SUBSTEPS = 42
 
@@ -45,18 +46,21 @@ class BlenderSettings:
 
     Attributes:
         substeps: Blender's quality steps per frame; stiff hinges get more, see :func:`steady_substeps`.
-        collision_rounds: Rounds of collision response in a substep.
-        scale: Blender's units of length to a metre.
+        collision_rounds: Number of rounds of collision response in a substep.
+        scale: Blender's units of length per metre.
         compression: Stiffness against compression as a share of that against tension. Cloth wrinkles instead of being
             compressed, but on a mesh only where wrinkles are longer than its edges: at 1, a flared skirt of 40 mm edges
             stands like a bell. Below 1, springs across a pull give way: at 0.03 a strip stretches 1.1 to 2.3 times as
-            far as its modulus says, depending on how its mesh lies, at 1 from 0.93 to 1.03.
-        distance: Kept between cloth and body [m].
-        self_distance: Kept between cloth and cloth [m]; at most a quarter of a garment's mean edge.
-        layer_distance: The same where a scene has several cloths: with less, layers go through each other.
-        drag: Coefficient of the air's force on a face, along its normal; 0 is a vacuum.
-        air_speed: Blender's air resistance is linear in the speed; it is right at this speed [m/s] plus the wind's.
-        threads: Of Blender, 1 or all (0). Where the system cannot hold a program to one processor, all.
+            far as its modulus predicts, depending on the orientation of its mesh, at 1 0.93 to 1.03 times.
+        distance: Distance kept between cloth and body [m].
+        self_distance: Distance kept between parts of a cloth [m]; at most a quarter of a garment's mean edge.
+        layer_distance: Distance kept between cloths in a scene with several ones [m]; with less, layers go through each
+            other.
+        drag: Coefficient of the air's force on a face along its normal, without unit; 0 is a vacuum.
+        air_speed: Speed at which Blender's air resistance, which is linear in the speed, is right, in addition to that
+            of the wind [m/s].
+        threads: Number of Blender's threads: 1, or 0 for all. If the system cannot limit a program to one processor,
+            Blender uses all.
     """
 
     substeps: int = 10
@@ -80,9 +84,9 @@ class BlenderSettings:
 
 
 def steps_taken(substeps: int) -> int:
-    """How many steps of 1 / substeps Blender takes in a frame: it adds them up, in float32, while they are below 1.
+    """Number of steps of 1 / substeps that Blender takes in a frame: it sums them in float32 while the sum is below 1.
 
-    12 are 13: bodies and pins then overshoot in every frame, and cloth falls too fast.
+    For 12 substeps it takes 13 steps: bodies and pins then overshoot in every frame, and cloth falls too fast.
     """
     if substeps < 1:
         raise ValueError(f"substeps must be at least 1, got {substeps}")
@@ -99,10 +103,14 @@ four stay within it for the 75 frames tried, at twice the time. A hanging strip 
 
 
 def steady_substeps(hardness: float, least: int) -> int:
-    """Substeps for hinges so hard, bending over mass, not to tremble, from `least` to :data:`MOST_SUBSTEPS`.
+    """Number of substeps with which hinges do not tremble, from `least` to :data:`MOST_SUBSTEPS`.
 
-    What is still too hard then bends more easily than its material asks for: at 0.2 kg/m^2 and a bending of 0.1 N on
-    edges below 15 mm, at 1 N below 33 mm.
+    Hinges that are too hard even for the largest number bend more easily than their material: at 0.2 kg/m^2 and a
+    bending of 0.1 N on edges below 15 mm, at 1 N below 33 mm.
+
+    Args:
+        hardness: Bending stiffness over mass, in Blender's units.
+        least: Least number of substeps.
     """
     wanted = max(least, min(MOST_SUBSTEPS, int(np.ceil(np.sqrt(hardness / STEADY)))))
     return next(n for n in range(wanted, wanted + 3) if steps_taken(n) == n)
@@ -120,8 +128,8 @@ def to_y_up(vectors: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Sheet:
-    """What a cloth's numbers depend on: its edges' number and mean length [m], the mass of a vertex [kg], the stiffness
-    of its springs [N/m] and of its hinges [N/m]."""
+    """The quantities from which a cloth's numbers follow: number of edges and their mean length [m], mass of a vertex
+    [kg], stiffness of springs [N/m] and of hinges [N/m]."""
 
     edges: int
     edge: float
@@ -149,11 +157,15 @@ class _Sheet:
 
 
 def blender_numbers(scene: ClothScene, settings: BlenderSettings) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What Blender is told about a scene.
+    """Blender's numbers for a scene.
+
+    Args:
+        scene: Scene to simulate, in SI units.
+        settings: Settings of the simulation.
 
     Returns:
-        Plain values for scene.json, and arrays: `structural` and `bending`, where the stiffness of each vertex lies
-        between the least and the largest [V], and `wind` [frames, 5], see :func:`air`, unless in a vacuum.
+        Plain values for scene.json, and arrays: `structural` and `bending`, place (0 to 1) of each vertex's stiffness
+        between the least and the largest, [V]; `wind`, [frames, 5], see :func:`air`, unless in a vacuum.
     """
     s, f = settings.scale, scene.fps
     sheets = [_Sheet.of(cloth) for cloth in scene.cloths]
@@ -218,27 +230,27 @@ def blender_numbers(scene: ClothScene, settings: BlenderSettings) -> tuple[dict[
 
 
 def _half_distance(distance: float, scale: float) -> float:
-    """Blender keeps the sum of two distances, each from 0.001 to 0.1 of its units."""
+    """Half of a distance [m] in Blender's units; Blender keeps the sum of two distances, each from 0.001 to 0.1."""
     return float(np.clip(0.5 * distance * scale, 1e-3, 0.1))
 
 
 def _weights(values: np.ndarray) -> np.ndarray:
-    """Where values lie between the least and the largest of them, 0 to 1."""
+    """Places of values between the least and the largest of them, 0 to 1."""
     span = values.max() - values.min()
     return (values - values.min()) / span if span > 1e-9 * values.max() else np.zeros_like(values)
 
 
 def air(scene: ClothScene, settings: BlenderSettings, ratio: float) -> np.ndarray:
-    """Blender's wind in each of its frames, [frames, 5]: direction, Z up, strength s and air flow F.
+    """Blender's wind in each of its frames, [frames, 5]: direction with Z up, strength s and air flow F.
 
     Drag is 1/2 rho cd A |w - v| (w - v).n along the normal n of a face; Blender has 0.02 A (s/f w/|w| - F v).n. On
-    cloth at rest both are the same for s = 1/2 rho cd |w|^2 k / (0.02 S f); moving cloth is slowed as by
-    1/2 rho cd A u v.n, u the wind's speed plus `air_speed`. Lift along the face has no counterpart.
+    cloth at rest both are equal for s = 1/2 rho cd |w|^2 k / (0.02 S f); moving cloth is slowed by 1/2 rho cd A u v.n,
+    where u is the wind's speed plus `air_speed`. Lift along the face has no counterpart.
 
     Args:
-        scene: With its wind.
-        settings: Scale, drag and air speed.
-        ratio: k, Blender's mass over mass.
+        scene: Scene with its wind.
+        settings: Settings, of which scale, drag and air speed are read.
+        ratio: Ratio k of Blender's mass of a vertex to its mass [1/kg].
     """
     s, f = settings.scale, scene.fps
     wind = np.zeros((len(scene), 3)) if scene.wind is None else np.asarray(scene.wind, dtype=np.float64)
@@ -252,15 +264,15 @@ def air(scene: ClothScene, settings: BlenderSettings, ratio: float) -> np.ndarra
 
 
 def pin_path(points: np.ndarray, body_frames: np.ndarray, body_faces: np.ndarray) -> np.ndarray:
-    """Where pinned points go: each keeps its place on, and its height above, the face nearest to it in the first frame.
+    """Path of pinned points, which keep their place on, and height above, the face nearest to them in the first frame.
 
     Args:
-        points: In the first frame [m], shape [P, 3].
-        body_frames: Body vertices [m], shape [T, U, 3].
-        body_faces: Shape [G, 3].
+        points: Positions in the first frame [m], shape [P, 3].
+        body_frames: Body vertices in every frame [m], shape [T, U, 3].
+        body_faces: Vertex indices of the body, shape [G, 3].
 
     Returns:
-        Shape [T, P, 3].
+        Positions in every frame [m], shape [T, P, 3].
     """
     face, weights, height = bound_to_body(points, body_frames[0], body_faces)
     corners = body_frames[:, body_faces[face]].astype(np.float64)  # [T, P, 3, 3]

@@ -1,4 +1,4 @@
-"""What moves the bodies and pins of all worlds of a Newton model, in one launch each whatever their number."""
+"""Kernels that move the bodies and pins of all worlds of a Newton model, in one launch each."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ def set_bodies_kernel(
     # In:
     before: wp.array[wp.vec3],
     after: wp.array[wp.vec3],
-    world: wp.array[int],  # of each body vertex
+    world: wp.array[int],  # world of each body vertex
     share: float,
     fps: float,
-    origin: wp.array[wp.vec3],  # of each world
+    origin: wp.array[wp.vec3],  # origin of each world's moving coordinates
     origin_velocity: wp.array[wp.vec3],
     # Out:
     points: wp.array[wp.vec3],
     velocities: wp.array[wp.vec3],
 ):
-    """Body vertices between two frames, in the moving frame of their world."""
+    """Body vertices between two frames of the motion, in the moving coordinates of their world."""
     i = wp.tid()
     w = world[i]
     points[i] = wp.lerp(before[i], after[i], share) - origin[w]
@@ -30,7 +30,7 @@ def set_bodies_kernel(
 def set_pins_kernel(
     # In:
     pin: wp.array[int],  # particle
-    corner: wp.array[wp.vec3i],  # the body vertices it is tied to
+    corner: wp.array[wp.vec3i],  # body vertices to which the particle is tied
     barycentric: wp.array[wp.vec3],
     height: wp.array[float],
     points: wp.array[wp.vec3],
@@ -39,7 +39,7 @@ def set_pins_kernel(
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
 ):
-    """Particles that keep their place on a body face and their height above it."""
+    """Pinned particles, which keep their place on a body face and their height above it."""
     i = wp.tid()
     a = corner[i][0]
     b = corner[i][1]

@@ -12,18 +12,21 @@ from warpgarment.training.teachers import ClothScene
 
 @dataclass(frozen=True)
 class NewtonSettings:
-    """Settings of VBD that gave clean drapes at 25 to 50 mm edges. SI units.
+    """Settings of VBD that gave clean drapes at edges of 25 to 50 mm.
 
     Attributes:
-        substeps, iterations: Per frame and per substep. Fewer than 10 substeps let the body through.
+        substeps: Number of substeps per frame. With fewer than 10, the body goes through the cloth.
+        iterations: Number of iterations per substep.
         bend_damping: Damping of an edge's bending [N s].
-        contact_stiffness, contact_damping: Body contact [N/m], [N s/m].
+        contact_stiffness: Stiffness of contact with the body [N/m].
+        contact_damping: Damping of contact with the body [N s/m].
         margin: Thickness added to the body [m].
-        contact_gap: Distance at which body contact is looked for [m].
-        radius: Particle radius as a share of the edge length; coarse faces let the body poke through otherwise.
-        self_margin, self_gap: Distance kept between cloths, and how much farther contact is looked for [m].
-        layer_friction: Coefficient between cloths; None: of each scene its own, the mean of its materials.
-        drag, lift: Coefficients of the air forces per face.
+        contact_gap: Distance within which contact with the body is detected [m].
+        radius: Particle radius as a share of the edge length; with a smaller one the body pokes through coarse faces.
+        self_margin: Distance kept between cloths [m].
+        self_gap: Distance beyond `self_margin` within which contact between cloths is detected [m].
+        layer_friction: Coefficient of friction between cloths; None takes the mean of the materials of each scene.
+        drag, lift: Coefficients of the air forces on each face, without unit.
     """
 
     substeps: int = 10
@@ -46,7 +49,7 @@ CONVERGED = NewtonSettings(substeps=20, iterations=10)
 
 
 def layer_friction(scene: ClothScene, settings: NewtonSettings) -> float:
-    """The coefficient between cloths, of which a model has one."""
+    """The coefficient of friction between cloths, of which a model has only one."""
     return _mean_friction(scene) if settings.layer_friction is None else settings.layer_friction
 
 

@@ -1,21 +1,22 @@
 """The Newton teacher: VBD cloth around moving bodies, one scene at a time or many worlds in one model.
 
-A body is a triangle mesh whose points are set and whose tree is refitted every substep. Cloth is simulated in a frame
-that moves with the body's smoothed centroid: self-contact caps how far a vertex may move, 0.425 (self_margin +
-self_gap) per detection and two detections a substep, so a running garment would otherwise trail behind its body. The
-frame's acceleration is added to gravity, its velocity taken from the wind. The path depends on the whole motion: a
-longer clip gives other bits. Air drag acts in still air too; set `drag` and `lift` to 0 for a vacuum.
+A body is a triangle mesh whose points are set and whose tree is refitted every substep. Cloth is simulated in
+coordinates that move with the body's smoothed centroid: self-contact limits the motion of a vertex to
+0.425 (self_margin + self_gap) per detection, with two detections per substep, so that the garment of a runner would
+otherwise trail behind the body. The acceleration of the coordinates is added to gravity, and their velocity is
+subtracted from the wind. Their path depends on the whole motion: a longer clip gives other bits. Air drag acts in still
+air, too; set `drag` and `lift` to 0 for a vacuum.
 
-VBD stops before it has converged. At 10 substeps of 5 iterations a strip 0.6 m long hangs 0.9 % (34 mm edges) to 1.3 %
-(27 mm) too long, at 10 x 10 half of that, at 20 x 10 0.15 %, whatever it is made of: differences in stretch below that
-do not show. `CONVERGED` is right for the small and soft sheets of :mod:`.checks`, at four times the cost.
+VBD stops before it has converged. With 10 substeps of 5 iterations a strip 0.6 m long hangs 0.9 % (34 mm edges) to
+1.3 % (27 mm) too long, with 10 x 10 half of that, with 20 x 10 0.15 %, for any material: smaller differences in stretch
+are not visible. `CONVERGED` is accurate for the small and soft sheets of :mod:`.checks`, at four times the cost.
 
-Contact between layers is Newton's self-contact, which does not care which cloth a particle belongs to. It keeps layers
+Contact between layers is Newton's self-contact, which does not distinguish the cloths of particles. It keeps layers
 `self_margin` apart if they start apart: rest meshes may lie anywhere, but in the start positions layers must not cross,
-the inner one at least 6 mm and outer ones at least 22 mm away from the body.
+and the inner one must be at least 6 mm and outer ones at least 22 mm away from the body.
 
-Friction against the body is one number a scene, the mean of its cloths' materials. Between cloths it is the same
-number, or `layer_friction`: Newton has one for a whole model, which worlds of different materials can only share so.
+Friction against the body is one number per scene, the mean over the materials of its cloths. Friction between cloths is
+that number, too, or `layer_friction`: Newton has one number for a whole model, so worlds in one model must share it.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ from .worlds import Worlds
 class NewtonTeacher:
     """Simulates cloth with Newton's VBD solver (extra `physics`).
 
-    On a CPU the same scene gives the same bits again. Among other worlds it does too until cloth touches cloth: the
-    order in which Newton adds up contact forces depends on a world's place in the model, which shows as rounding (below
-    1e-6 m in the first frames of a touch) and grows from there as everything does in cloth. A GPU adds in any order.
+    On a CPU equal scenes give equal bits. Beside other worlds they do so, too, until cloth touches cloth: the order in
+    which Newton sums contact forces depends on a world's place in the model, which causes rounding differences (below
+    1e-6 m in the first frames of a contact) that grow as all differences do in cloth. A GPU sums in any order.
 
     Args:
-        settings: Of the solver.
-        device: Warp device: "cpu", "cuda:0"; None takes Warp's default.
+        settings: Settings of the solver; None for the defaults.
+        device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.
 
     Raises:
         MissingExtra: Newton is not installed.
@@ -72,22 +73,25 @@ class NewtonTeacher:
         A scene that becomes NaN yields NaN from then on.
 
         Raises:
-            TeacherError: The scene cannot be simulated; the message says why.
+            TeacherError: The scene cannot be simulated; the message has the reason.
         """
         check_scenes([scene])
         for (vertices,) in self._run([scene]):
             yield vertices
 
     def simulate_many(self, scenes: Sequence[ClothScene]) -> Iterator[list[np.ndarray | None]]:
-        """Several scenes at once, each in a world of its own: per frame one array a scene, None once it has ended.
+        """Simulates several scenes at once, each in a world of its own.
 
-        Scenes that share frame rate, settling time and friction between cloths (see `NewtonSettings.layer_friction`)
-        run as the worlds of one model, with one set of launches however many they are, but for the refit of each body;
-        others run beside them in models of their own. A world is simulated until the longest of its model ends: put
-        scenes of like length together.
+        Scenes with equal frame rate, settling time and friction between cloths (see `NewtonSettings.layer_friction`)
+        are the worlds of one model, with one set of launches for all of them, except for the refit of each body; other
+        scenes are simulated in models of their own. A world is simulated until the longest one in its model ends, so
+        scenes should be of similar length.
+
+        Yields:
+            For every frame, the vertices of each scene [m], float32 [V, 3], or None once a scene has ended.
 
         Raises:
-            TeacherError: A scene cannot be simulated; the message says which and why.
+            TeacherError: A scene cannot be simulated; the message has its number and the reason.
         """
         check_scenes(scenes)
         models: dict[tuple[float, int, float], list[int]] = {}
@@ -122,7 +126,7 @@ class NewtonTeacher:
         now, later = model.state(), model.state()
         worlds.place(now, later)
         if any(cloth.start is not None for scene in scenes for cloth in scene.cloths):
-            solver.rebuild_bvh(now)  # its tree was built over the rest meshes
+            solver.rebuild_bvh(now)  # the solver's tree was built over the rest meshes
         dt = 1.0 / options.substeps / scenes[0].fps
         settle = scenes[0].settle
 
@@ -149,7 +153,7 @@ class NewtonTeacher:
                         drag=options.drag,
                         lift=options.lift,
                     )
-                if frame == 0 and step == 0:  # compiles; a graph can only be captured of what is loaded
+                if frame == 0 and step == 0:  # compiles the kernels; only loaded kernels can be captured in a graph
                     advance()
                 else:
                     if id(now) not in graphs:
@@ -158,12 +162,12 @@ class NewtonTeacher:
                         graphs[id(now)] = capture.graph
                     wp.capture_launch(graphs[id(now)])
                 now, later = later, now
-            found = worlds.end_frame(frame, now)
-            for w, vertices in enumerate(found):
+            vertices_of_worlds = worlds.end_frame(frame, now)
+            for w, vertices in enumerate(vertices_of_worlds):
                 if w not in aside and not np.isfinite(vertices).all():
                     aside.add(w)
                     worlds.put_aside(w, now, later)
                 if w in aside:
-                    found[w] = np.full_like(vertices, np.nan)
+                    vertices_of_worlds[w] = np.full_like(vertices, np.nan)
             if frame >= settle:
-                yield found
+                yield vertices_of_worlds

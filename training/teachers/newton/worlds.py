@@ -1,8 +1,8 @@
-"""Several cloth scenes as worlds of one Newton model, and everything that is written into it as they go on.
+"""Several cloth scenes as worlds of one Newton model, and all data that are written into it during the simulation.
 
 Arrays are packed over worlds: bodies end to end, cloths end to end. Each body is a mesh of its own whose points are a
-slice of one array, so that one launch moves all bodies; each mesh then needs a refit of its own, the only launches
-whose number grows with the number of worlds.
+slice of one array, so that one launch moves all bodies; each mesh then needs a refit of its own. Only the number of
+these launches grows with the number of worlds.
 """
 
 from __future__ import annotations
@@ -22,22 +22,23 @@ from .settings import _mean_friction, layer_friction
 if TYPE_CHECKING:
     from .settings import NewtonSettings
 
-REACH = 5.0  # metres about a body's first pose within which it is looked for
+REACH = 5.0  # distance from a body's first pose within which contact with the body is detected [m]
 
 
 class Worlds:
     """Scenes of equal frame rate, settling time and friction between layers, side by side in one model.
 
     Args:
-        newton: The module.
-        scenes: One a world.
-        settings: Of the teacher.
+        newton: The module `newton`.
+        scenes: Scenes, one per world.
+        settings: Settings of the teacher.
         device: Warp device.
 
     Attributes:
-        model: Newton's.
-        starts: First particle of each world, and their number, int [W + 1].
-        gravity, air: Of each world at present, vec3 [W], views of what `advance` has uploaded.
+        model: Newton's model.
+        starts: First particle of each world, and the number of particles, int [W + 1].
+        gravity: Current gravity of each world [m/s^2], vec3 [W], a view of the uploaded values.
+        air: Current velocity of the air in each world [m/s], vec3 [W], a view of the uploaded values.
     """
 
     def __init__(self, newton: Any, scenes: Sequence[ClothScene], settings: NewtonSettings, device: wp.Device):
@@ -61,15 +62,15 @@ class Worlds:
                     groups.append([])
                 groups[color].append(np.asarray(group) + self.starts[w])
             root.add_world(builder)
-        # Newton would merge small colors of one world with large ones of another; a world's own order, and with it
-        # its result, must not depend on its neighbours
+        # Newton would merge small colors of one world with large ones of another. The order within a world, and with
+        # it the result, must not depend on other worlds.
         root.set_coloring([np.concatenate(group) for group in groups])
         self.model = model = root.finalize(device=device)
         model.soft_contact_ke, model.soft_contact_kd = settings.contact_stiffness, settings.contact_damping
         model.soft_contact_mu = layer_friction(scenes[0], settings)
         for box, by in ((model.shape_collision_aabb_lower, -REACH), (model.shape_collision_aabb_upper, REACH)):
             if shapes:
-                box.assign(box.numpy() + np.float32(by))  # contacts are culled against the first pose otherwise
+                box.assign(box.numpy() + np.float32(by))  # otherwise contacts are culled against the first pose
 
         count = int(body_starts[-1])
         with wp.ScopedDevice(device):
@@ -90,11 +91,11 @@ class Worlds:
 
     @property
     def has_bodies(self) -> bool:
-        """Whether any world has one."""
+        """Whether any world has a body."""
         return bool(self._meshes)
 
     def place(self, *states: Any) -> None:
-        """Puts the cloths where they start."""
+        """Writes the start positions of the cloths into states of the model."""
         parts = []
         for scene, frame in zip(self.scenes, self._frames, strict=True):
             first = np.concatenate([cloth.first for cloth in scene.cloths])
@@ -103,7 +104,7 @@ class Worlds:
             state.particle_q.assign(np.concatenate(parts))
 
     def begin_frame(self, frame: int) -> None:
-        """Uploads what the bodies, frames of reference and winds do during a frame of the simulation."""
+        """Uploads the motion of bodies, moving coordinates and winds during a frame of the simulation."""
         self._before, self._after = self._after, self._before
         shown = [self._body_at(frames, frame) for frames in self._bodies]
         self._after.assign(np.concatenate(shown))
@@ -144,7 +145,7 @@ class Worlds:
                 device=self.device,
             )
         for mesh in self._meshes:
-            mesh.refit()  # silently skipped inside a captured CPU graph
+            mesh.refit()  # Warp silently skips this inside a captured CPU graph
         if self._pins:
             wp.launch(
                 set_pins_kernel,
@@ -156,16 +157,16 @@ class Worlds:
         return self._air[part]
 
     def end_frame(self, frame: int, state: Any) -> list[np.ndarray]:
-        """Vertices of each world at the end of a frame, float32 [V, 3]."""
+        """Vertices of each world at the end of a frame [m], float32 [V, 3]."""
         points = state.particle_q.numpy()
-        found = []
+        vertices = []
         for w, path in enumerate(self._frames):
-            mine = points[self.starts[w] : self.starts[w + 1]]
-            found.append((mine + path.origin(frame + 1.0)).astype(np.float32))
-        return found
+            of_world = points[self.starts[w] : self.starts[w + 1]]
+            vertices.append((of_world + path.origin(frame + 1.0)).astype(np.float32))
+        return vertices
 
     def put_aside(self, world: int, *states: Any) -> None:
-        """Takes a world that has become NaN out of the simulation: its particles rest where they started."""
+        """Removes a world that has become NaN from the simulation: its particles rest at their start positions."""
         part = slice(int(self.starts[world]), int(self.starts[world + 1]))
         flags = self.model.particle_flags.numpy()
         flags[part] = 0
@@ -178,11 +179,11 @@ class Worlds:
                 array.assign(held)
 
     def _body_at(self, frames: np.ndarray, frame: int) -> np.ndarray:
-        """A body stands still before its first frame and after its last."""
+        """Body vertices in a frame [m], [U, 3]; a body stands still before its first frame and after its last."""
         return frames[np.clip(frame - self._settle, 0, len(frames) - 1)]
 
     def _wind(self, scene: ClothScene, frame: int, share: np.ndarray) -> np.ndarray:
-        """Velocity of the air between the frame before and this one [m/s], [S, 3]."""
+        """Velocity of the air at shares of the time between the previous frame and this one [m/s], [S, 3]."""
         if scene.wind is None:
             return np.zeros((len(share), 3))
         wind = np.asarray(scene.wind, dtype=np.float64)
@@ -190,7 +191,7 @@ class Worlds:
         return before + (after - before) * share[:, None]
 
     def _bound_pins(self, newton: Any, bodies: list, body_starts: np.ndarray) -> list[wp.array]:
-        """Clears the flag of every pinned particle; returns what ties those of worlds with a body to it."""
+        """Clears the flag of every pinned particle; returns the arrays that tie pinned particles to bodies."""
         flags = self.model.particle_flags.numpy()
         parts: list[tuple[np.ndarray, ...]] = []
         for w, (scene, (frames, faces)) in enumerate(zip(self.scenes, bodies, strict=True)):
@@ -238,7 +239,7 @@ def _world(
         )
     mesh = None
     if len(body_faces):
-        # meshes with velocities are never merged, however alike two bodies are in their first pose
+        # meshes with velocities are never merged, even if two bodies are alike in their first pose
         mesh = newton.Mesh(body_points, body_faces.ravel(), compute_inertia=False, enable_surface_velocity=True)
         # Newton takes the geometric mean of the cloths' coefficient and the shape's
         friction = _mean_friction(scene) ** 2 / max(layer_friction(scene, settings), 1e-9)

@@ -5,7 +5,7 @@
     velocities [C, (H-1)*3]  -> linear -> C tokens --+   (attention.py)      +-> linear -> q (3) per component
 
 History is oldest first: feature k of frame h is number h*34 + k, and h = H-1 is the newest. There is no positional
-encoding: where a face lies is among its features. What it shares with other networks is in `garment_network.py`.
+encoding: where a face lies is among its features. What it shares with other networks is in `nn/network.py`.
 """
 
 from __future__ import annotations

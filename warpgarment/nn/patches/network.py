@@ -5,7 +5,7 @@
                                                            P patches -> encoder layers -+
     velocities [C, (H-1)*3] -> linear, + linear(mean) --> C tokens  ->  (attention.py) ------------------------> q
 
-The mean is that of the piece of cloth that the velocities are of. `patches.py` says how faces are pooled into patches
+The mean is that of the piece of cloth that the velocities are of. `layout.py` says how faces are pooled into patches
 and hear of them again. The encoder layers are those of the manifold-aware transformer, with geodesic distances between
 the patches' centres. A face layer is a small perceptron on each face; those after the patches also see the mean of its
 neighbours across the edges, so that folds much smaller than a patch are kept. At first they do not listen to it, so a
