@@ -33,7 +33,7 @@ class Progress:
     def summary(self) -> torch.Tensor:
         """`iterations`, components stopped by the limit, their largest error [m]; float64 [3] on the device.
 
-        Does not wait for the solve: hand it to `tell` once it has been read.
+        Does not wait for the solve: give it to `warn_if_stopped` once it has been read.
         """
         reports, errors = (torch.stack(tensors) for tensors in zip(*self._solves, strict=True))
         if not reports.shape[1]:
@@ -42,7 +42,7 @@ class Progress:
         iterations = reports.abs().amax(1).sum()
         return torch.stack([iterations.double(), stopped.sum().double(), torch.where(stopped, errors, 0.0).max()])
 
-    def tell(self, stopped: float, components: int, error: float) -> None:
+    def warn_if_stopped(self, stopped: float, components: int, error: float) -> None:
         """Warns, once, if components were stopped by the limit."""
         if self._warned or not stopped:
             return
@@ -58,4 +58,4 @@ class Progress:
     def _warn(self, report: torch.Tensor, error: torch.Tensor) -> None:
         stopped = report < 0
         if not self._warned and bool(stopped.any()):
-            self.tell(int(stopped.sum()), len(report), float(error[stopped].max()))
+            self.warn_if_stopped(int(stopped.sum()), len(report), float(error[stopped].max()))

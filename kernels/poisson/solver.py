@@ -153,12 +153,15 @@ class PoissonSolver:
         return self._progress.iterations
 
     def summary(self) -> torch.Tensor:
-        """What the last solve says: iterations, components stopped by the limit, their largest error; not read."""
+        """Iterations of the last solve, components stopped by the limit and their largest error [m]; float64 [3].
+
+        Stays on the device: give it to `warn_if_stopped` once it has been read.
+        """
         return self._progress.summary()
 
-    def tell(self, stopped: float, error: float) -> None:
-        """Warns, once, if a summary that was read from the device says that components were stopped."""
-        self._progress.tell(stopped, self.component_count, error)
+    def warn_if_stopped(self, stopped: float, error: float) -> None:
+        """Warns, once, if a summary that was read from the device counts components that were stopped."""
+        self._progress.warn_if_stopped(stopped, self.component_count, error)
 
     def solve(
         self,

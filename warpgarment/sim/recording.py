@@ -27,7 +27,7 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
     """Reads frames from the device, all in one go, and warns of solves that did not converge.
 
     Args:
-        scene: Theirs.
+        scene: The scene that the frames belong to.
         first: Number of the first frame.
         frames: `Frame.outcome` of this and the following frames.
     """
@@ -38,7 +38,7 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
         for part, sound in zip(parts, finite[k], strict=True):
             if not sound:
                 part[:] = np.nan
-        scene.tell(solves[k])
+        scene.warn_if_stopped(solves[k])
         iterations = [int(n) for n in solves[k, :, 0]]
         judged = zip(finite[k], depth[k], strict=True)
         statuses = [RolloutStatus.judged(first + k, bool(f), float(d), *iterations) for f, d in judged]

@@ -266,10 +266,10 @@ class Scene:
                 depth = self.depth(vertices, bodies)
         return vertices, finite, depth, solves
 
-    def tell(self, solves: np.ndarray) -> None:
+    def warn_if_stopped(self, solves: np.ndarray) -> None:
         """Warns of solves that stopped at their limit; `solves` [2,3] as in `SimulationState`, read from the device."""
-        for tell, (_, stopped, error) in zip((self.poisson.tell, self.collision.tell), solves, strict=True):
-            tell(stopped, error)
+        for solver, (_, stopped, error) in zip((self.poisson, self.collision), solves, strict=True):
+            solver.warn_if_stopped(stopped, error)
 
     def depth(self, vertices: torch.Tensor, bodies: BodyMeshes) -> torch.Tensor:
         """How deep each garment is in its body, between its vertices too [m], at least 0; shape [B]."""
