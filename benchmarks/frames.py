@@ -57,7 +57,7 @@ class FrameCounts:
 
     def __init__(self, scene, now, next_body: torch.Tensor) -> None:
         self.launches: Counter[str] = Counter()
-        early, scene.early_exit = scene.early_exit, False
+        early, scene.contact.early_exit = scene.contact.early_exit, False
         patches = [mock.patch.object(wp, name, self._counted(getattr(wp, name))) for name in ("launch", "launch_tiled")]
         refit = wp.Mesh.refit
 
@@ -77,7 +77,7 @@ class FrameCounts:
         finally:
             for patch in patches:
                 patch.stop()
-            scene.early_exit = early
+            scene.contact.early_exit = early
         self.operators = seen.counts
         # Sizes of the compliance matrices are on the host.
         self.reads = [name for name, tensor in seen.read if tensor.dtype != torch.int64 or tensor.numel() != 1]
@@ -141,7 +141,7 @@ def _profiled(faces: int, number: int, device: torch.device, named: Named, graph
             rolling()
     seen = {event.key: event.count / FRAMES for event in profile.key_averages()}
     torch.cuda.synchronize(device)
-    recorded = rolling.state.scene.graph is not None and rolling.state.scene.graph.recorded
+    recorded = rolling.state.graph is not None and rolling.state.graph.recorded
     return {
         "faces": len(rolling.state.scene.packed.faces) // number,
         "graph": recorded,

@@ -15,7 +15,7 @@ if wp.config.log_level == wp.LOG_INFO:  # the user's own setting stays; Warp's d
 MOST_DESCRIPTORS = 16_384  # a few MB; a frame has some hundred, training has many that never recur
 _descriptors: dict[tuple[object, ...], Any] = {}
 
-_DTYPES = {torch.float32: "float32", torch.int32: "int32"}
+_DTYPES = {torch.float32: "float32", torch.float64: "float64", torch.int32: "int32"}
 
 
 def expect(

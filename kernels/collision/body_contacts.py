@@ -7,6 +7,8 @@ surface looks the other way than that face, the contact is with that face.
 
 from __future__ import annotations
 
+import math
+
 import torch
 import warp as wp
 
@@ -14,6 +16,8 @@ from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.closest import Bodies, closest_on_triangle
+
+from .contact_set import ContactFrame, Contacts
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
 """Below this distance [m] the direction from the closest point is noise, and the face's normal is taken."""
@@ -83,25 +87,6 @@ def find_contacts(
     normal[i] = n
 
 
-@wp.kernel(enable_backward=False)
-def contact_gap(
-    # In:
-    vertices: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3d],
-    closest: wp.array[wp.vec3d],
-    epsilon: wp.float64,
-    # Out:
-    gap: wp.array[wp.float64],
-):
-    """c = ε - n·(Ṽ - U) at the contacts, zero elsewhere."""
-    i = wp.tid()
-    n = normal[i]
-    c = wp.float64(0.0)
-    if wp.dot(n, n) > c:
-        c = epsilon - wp.dot(n, wp.vec3d(vertices[i]) - closest[i])
-    gap[i] = c
-
-
 def contacts(
     vertices: torch.Tensor,
     distance: torch.Tensor,
@@ -150,3 +135,34 @@ def contacts(
             device=device,
         )
     return closest, normal
+
+
+class BodyContacts:
+    """The contacts of garments with the bodies that they are on."""
+
+    name = "body"
+
+    def find(self, vertices: torch.Tensor, frame: ContactFrame) -> Contacts:
+        """One contact at each vertex that is closer to its body than `frame.epsilon`.
+
+        Args:
+            vertices: Positions [m], float32 [V,3].
+            frame: The bodies, who is on which, the distance to keep and where the vertices come from.
+
+        Returns:
+            Contacts without stencils, [V].
+        """
+        bodies, on_body, _, epsilon, origin = frame
+        query = bodies.query(vertices.detach(), on_body, within=epsilon)
+        closest, normal = contacts(
+            vertices,
+            query.distance,
+            query.face,
+            bodies,
+            math.inf if isinstance(epsilon, torch.Tensor) else epsilon,
+            body_of_vertex=on_body,
+            origin=origin,
+        )
+        if isinstance(epsilon, torch.Tensor):
+            normal = torch.where((query.distance < epsilon)[:, None], normal, 0.0)
+        return Contacts(normal, closest, epsilon)

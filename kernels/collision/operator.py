@@ -24,8 +24,8 @@ from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.operator import allocate, unpack
 
 from . import forces_factor_cpu, forces_inverse_cpu, forces_inverse_gpu
-from .body_contacts import contact_gap
 from .compliance import Compliance
+from .contact_set import contact_gap
 
 ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
@@ -95,14 +95,14 @@ def _solve(
 def collision_solve(
     vertices: torch.Tensor,
     normal: torch.Tensor,
-    closest: torch.Tensor,
-    epsilon: float,
+    anchor: torch.Tensor,
+    distance: float,
     tolerance: torch.Tensor,
     model: list[torch.Tensor],
     max_iterations: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The minimiser of eq. 5 for given contacts. Returns vertices, iterations and error per component."""
-    vertices, normal, closest = vertices.contiguous(), normal.contiguous(), closest.contiguous()
+    vertices, normal, anchor = vertices.contiguous(), normal.contiguous(), anchor.contiguous()
     gap = allocate((len(vertices),), torch.float64, vertices.device)
     with torch_stream(vertices.device) as device:
         wp.launch(
@@ -111,8 +111,8 @@ def collision_solve(
             inputs=[
                 as_argument(vertices, wp.vec3),
                 as_argument(normal, wp.vec3d),
-                as_argument(closest, wp.vec3d),
-                float(epsilon),
+                as_argument(anchor, wp.vec3d),
+                float(distance),
                 as_argument(gap, wp.float64),
             ],
             device=device,
@@ -125,8 +125,8 @@ def collision_solve(
 def _(
     vertices: torch.Tensor,
     normal: torch.Tensor,
-    closest: torch.Tensor,
-    epsilon: float,
+    anchor: torch.Tensor,
+    distance: float,
     tolerance: torch.Tensor,
     model: list[torch.Tensor],
     max_iterations: int,

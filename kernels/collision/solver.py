@@ -16,17 +16,17 @@ where there is neither (operator.py).
 | symbol | code | what |
 | --- | --- | --- |
 | Ṽ, V | `vertices`, result | garment before and after |
-| U_i | `closest` | closest point of the body surface or, where that is the far side, of the face of entry's plane |
+| U_i | `anchor` | closest point of the body surface or, where that is the far side, of the face of entry's plane |
 | n_i | `normal` | sign (Ṽ_i - U_i) / |Ṽ_i - U_i|, or the face's normal at the surface and at entry; zero outside C |
-| ε | `epsilon` | distance kept from the body |
+| ε | `epsilon`, `distance` | distance kept from the body |
 | L | `laplacian.cotangent_laplacian` | of the rest mesh, unitless |
+
+These contacts are one kind (body_contacts.py); `solve` takes those of any source (contact_set.py).
 
 The gradient with respect to Ṽ is the adjoint for fixed contacts: V = Ṽ - A⁻¹ n nᵀ Ṽ + const, so one more solve with A.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import scipy.sparse
@@ -42,8 +42,9 @@ from warpgarment.kernels.operator import pack
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from . import compliance
-from .body_contacts import contacts
+from .body_contacts import BodyContacts
 from .compliance import Compliance
+from .contact_set import ContactFrame, Contacts, one_for_each_vertex
 from .operator import Model
 
 TOLERANCE = 2e-6
@@ -118,16 +119,19 @@ class CollisionSolver:
         return self._progress.iterations
 
     def summary(self) -> torch.Tensor:
-        """What the last refinement says: iterations, components stopped by the limit, their largest error; not read."""
+        """Iterations of the last refinement, components stopped by the limit and their largest error [m]; float64 [3].
+
+        Stays on the device: give it to `warn_if_stopped` once it has been read.
+        """
         return self._progress.summary()
 
     def warn_if_stopped(self, stopped: float, error: float) -> None:
-        """Warns, once, if a summary that was read from the device says that components were stopped."""
+        """Warns, once, if a summary that was read from the device counts components that were stopped."""
         self._progress.warn_if_stopped(stopped, self.component_count, error)
 
     @property
     def contacts(self) -> int:
-        """Vertices closer than epsilon in the first pass of the last refinement."""
+        """Number of contacts in the first pass of the last refinement."""
         return 0 if self._contacts is None else int(self._contacts)
 
     def refine(
@@ -167,38 +171,64 @@ class CollisionSolver:
         expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
         if body_of_vertex is not None:
             expect("body_of_vertex", body_of_vertex, (self.vertex_count,), torch.int32, self.device)
-        reach, kept = (math.inf, 0.0) if isinstance(epsilon, torch.Tensor) else (epsilon, epsilon)
         if isinstance(epsilon, torch.Tensor):
             expect("epsilon", epsilon, (self.vertex_count,), device=self.device)
         elif not epsilon >= 0:
             raise ValueError(f"epsilon must not be negative, got {epsilon}")
         if origin is not None:
             expect("origin", origin, (self.vertex_count, 3), device=self.device)
-        if not tolerance > 0:
-            raise ValueError(f"tolerance must be positive, got {tolerance}")
         if passes < 1:
             raise ValueError(f"passes must be at least 1, got {passes}")
-        limit = torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
+        limit = self._limit(tolerance)
+        source = BodyContacts()
+        frame = ContactFrame(bodies, body_of_vertex, epsilon=epsilon, origin=origin)
         for number in range(passes):
-            query = bodies.query(vertices.detach(), body_of_vertex, within=epsilon)
-            closest, normal = contacts(
-                vertices,
-                query.distance,
-                query.face,
-                bodies,
-                reach,
-                body_of_vertex=body_of_vertex,
-                origin=origin,
-            )
-            if isinstance(epsilon, torch.Tensor):  # n.(V - U) - e = n.(V - (U + e n)), so the solver's epsilon is zero
-                normal = torch.where((query.distance < epsilon)[:, None], normal, 0.0)
-                closest = closest + epsilon[:, None] * normal
-            if number == 0:
-                self._contacts = torch.count_nonzero((normal != 0).any(dim=1))
-            vertices, report, error = torch.ops.warpgarment.collision_solve(
-                vertices, normal, closest, kept, limit, self._model, self.max_iterations
-            )
-            self._progress.record(report, error, self.max_iterations, add=number > 0)
+            vertices = self._solve(vertices, source.find(vertices, frame), limit, first=number == 0)
+        return vertices
+
+    def solve(self, vertices: torch.Tensor, contacts: Contacts, *, tolerance: float = TOLERANCE) -> torch.Tensor:
+        """Minimises eq. 5 of supplement section 2 for contacts that a source has found at `vertices`.
+
+        Differentiable in `vertices`; the contacts are constants.
+
+        Args:
+            vertices: Predicted positions [m], float32 [V,3].
+            contacts: At most one for each vertex: K = V, without stencils.
+            tolerance: Where the iteration stops, as in `refine`.
+
+        Returns:
+            Positions [m], float32 [V,3]; components without contacts come back unchanged.
+
+        Raises:
+            ValueError: Contacts with stencils; wrong shape or device; a tolerance that is not positive.
+            TypeError: Wrong dtype.
+        """
+        expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
+        one_for_each_vertex(contacts)
+        for name, tensor in (("normal", contacts.normal), ("anchor", contacts.anchor)):
+            expect(f"contacts.{name}", tensor, (self.vertex_count, 3), torch.float64, self.device)
+        if isinstance(contacts.distance, torch.Tensor):
+            kind = contacts.distance.dtype if contacts.distance.is_floating_point() else torch.float64
+            expect("contacts.distance", contacts.distance, (self.vertex_count,), kind, self.device)
+        return self._solve(vertices, contacts, self._limit(tolerance), first=True)
+
+    def _limit(self, tolerance: float) -> torch.Tensor:
+        """The tolerance of each component, float64 [C]."""
+        if not tolerance > 0:
+            raise ValueError(f"tolerance must be positive, got {tolerance}")
+        return torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
+
+    def _solve(self, vertices: torch.Tensor, contacts: Contacts, limit: torch.Tensor, *, first: bool) -> torch.Tensor:
+        """One solve; its report replaces those of earlier ones if it is the first of a refinement."""
+        normal, anchor, distance, *_ = contacts
+        if isinstance(distance, torch.Tensor):  # n.(V - U) - d = n.(V - (U + d n)), so the operator's distance is zero
+            anchor, distance = anchor + distance[:, None] * normal, 0.0
+        if first:
+            self._contacts = torch.count_nonzero((normal != 0).any(dim=1))
+        vertices, report, error = torch.ops.warpgarment.collision_solve(
+            vertices, normal, anchor, distance, limit, self._model, self.max_iterations
+        )
+        self._progress.record(report, error, self.max_iterations, add=not first)
         return vertices
 
 

@@ -83,7 +83,7 @@ def test_passes_decided_on_the_device(shift, monkeypatch):
     class Decided(simulator_module.Scene):
         def __init__(self, *args, **options):
             super().__init__(*args, **options)
-            self.early_exit = False
+            self.contact.early_exit = False
             scenes.append(self)
 
     monkeypatch.setattr(simulator_module, "Scene", Decided)
@@ -130,7 +130,7 @@ def sim_with(request, monkeypatch):
         sim = Simulator(network(), device)
         if device == "cpu":
             graphed = graph.GraphedFrames
-            monkeypatch.setattr(simulator_module, "GraphedFrames", lambda s, a: graphed(s, a, record))
+            monkeypatch.setattr(simulator_module, "GraphedFrames", lambda scene: graphed(scene, record))
             sim.graph = True
         return sim
 
@@ -157,7 +157,7 @@ def test_replays_are_the_frames(device, sim_with):
     state = sim.start(skirt(), motion.vertices[0], motion.faces)
     for t in range(1, 6):
         state = sim.step(state, motion.vertices[t])
-    assert state.scene.graph.recorded
+    assert state.graph.recorded
     kept = state.now.positions.clone()
     first = sim.step(state, motion.vertices[6])
     elsewhere = sim.step(sim.step(state, other.vertices[6]), other.vertices[7])

@@ -53,8 +53,8 @@ def frame(device: str) -> dict[str, np.ndarray]:
     history = History.cold(features.detach(), scene.packed.component_count, scene.network.config.history)
     step = scene.predict(history.stacked(features), history.velocities)
     solved, finite = scene.reconstruct(vertices, step, features, following)
-    origin = scene.carried(vertices.detach(), features.detach())
-    pushed, _, depth, _ = scene.push_out(solved, following, finite, origin)
+    origin = scene.contact.origin(vertices.detach(), features.detach())
+    pushed, _, depth, _ = scene.contact(solved, following, finite, origin)
     (pushed * torch.linspace(-1.0, 1.0, pushed.numel(), device=device).view_as(pushed)).sum().backward()
     found = {
         "features": features,

@@ -8,17 +8,20 @@ from support.scenes import network
 
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.sim.scene import Scene
 from warpgarment.sim.simulator import Simulator
+from warpgarment.sim.stages.contact import Contact
+from warpgarment.sim.stages.reconstruct import Reconstruct
 
 
 @pytest.mark.parametrize("remembers", [True, False])
 def test_a_rollout_remembers_on_which_side_cloth_is(monkeypatch, remembers):
     """Cloth that would stay where it is, and a limb 8 cm thick that comes up under it at 5 cm a frame."""
-    solve = Scene.reconstruct
-    monkeypatch.setattr(Scene, "reconstruct", lambda self, vertices, *rest: (vertices, solve(self, vertices, *rest)[1]))
+    solve = Reconstruct.__call__
+    monkeypatch.setattr(
+        Reconstruct, "__call__", lambda self, vertices, *rest: (vertices, solve(self, vertices, *rest)[1])
+    )
     if not remembers:
-        monkeypatch.setattr(Scene, "carried", lambda self, vertices, _: torch.full_like(vertices, torch.nan))
+        monkeypatch.setattr(Contact, "origin", lambda self, vertices, _: torch.full_like(vertices, torch.nan))
     sheet, limb = meshes.sheet_and_limb()
     cloth = Garment(sheet.vertices, sheet.faces)
     rise = 0.05 * np.arange(4)[:, None, None] * np.float32([0.0, 1.0, 0.0])

@@ -13,8 +13,9 @@ from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.surface_depth import surface_depth
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.sim import scene
 from warpgarment.sim.simulator import Simulator
+from warpgarment.sim.stages import contact
+from warpgarment.sim.stages.reconstruct import Reconstruct
 from warpgarment.sim.surface import AMPLE, distance_to_keep
 
 LATTICE = np.array([(a, b, 10 - a - b) for a in range(11) for b in range(11 - a)]) / 10.0
@@ -132,12 +133,12 @@ def test_a_knob_does_not_show_through(monkeypatch, looks_between):
     Depth by libigl at 66 points a face. 0.1 mm is where passes end; where edges cross more may be left,
     here 0.2 mm.
     """
-    solve = scene.Scene.reconstruct
+    solve = Reconstruct.__call__
     monkeypatch.setattr(
-        scene.Scene, "reconstruct", lambda self, vertices, *rest: (vertices, solve(self, vertices, *rest)[1])
+        Reconstruct, "__call__", lambda self, vertices, *rest: (vertices, solve(self, vertices, *rest)[1])
     )
     if not looks_between:
-        monkeypatch.setattr(scene, "distance_to_keep", lambda epsilon, *_: epsilon)
+        monkeypatch.setattr(contact, "distance_to_keep", lambda epsilon, *_: epsilon)
     x, z = (axis.ravel() for axis in np.meshgrid(*[0.08 * np.arange(-2, 3)] * 2, indexing="ij"))
     corner = np.arange(20).reshape(4, 5)[:, :4].ravel()
     faces = np.concatenate(

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgarment.kernels.deformation import face_centroids, segment_mean
-from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.features.face import FEATURES, LAYOUT
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
@@ -163,8 +162,9 @@ class UnrolledBuilder:
             timings=Timings(device),
         )
         positions, interactions = torch.cat(past, dim=1), torch.cat(rows, dim=1)  # [H,V,3], [H,F,16]
-        features = torch.stack([_features(scene, v, r) for v, r in zip(positions, interactions, strict=True)], dim=1)
-        means = torch.stack([scene.components_mean(v) for v in positions], dim=1)  # [C,H,3]
+        known = zip(positions, interactions, strict=True)
+        features = torch.stack([scene.features.of_interaction(v.contiguous(), unpack(r)) for v, r in known], dim=1)
+        means = torch.stack([scene.centroids(v) for v in positions], dim=1)  # [C,H,3]
         turn, joint, mirrored = self._symmetries(streams)
         return UnrolledBatch(
             scene=scene,
@@ -193,13 +193,6 @@ class UnrolledBuilder:
             mirrored[b] = rng.random() < settings.mirror
         world, joint = rotation_about_up(torch.from_numpy(angles).to(self.device))
         return joint @ world, joint, torch.from_numpy(mirrored).to(self.device)
-
-
-def _features(scene: Scene, vertices: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-    """Features of a frame [F,34] from positions and cached interactions [F,16]."""
-    packed, vertices = scene.packed, vertices.contiguous()
-    mean = segment_mean(face_centroids(vertices, packed.faces), packed.garment_of_face, packed.count)
-    return face_features(scene.inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, unpack(rows))
 
 
 def _means(owner: torch.Tensor, count: int) -> torch.Tensor:

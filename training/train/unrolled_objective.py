@@ -2,7 +2,7 @@ r"""Training on several steps in a row: the network's own prediction becomes its
 
     predict -> compose -> singular values -> Poisson -> collisions -> features of the next frame -> predict -> ...
 
-with the methods of `warpgarment.sim.scene.Scene`, which the simulator runs. Every step k = 1..K has the loss of
+with the stages of `warpgarment.sim.scene.Scene`, which the simulator runs. Every step k = 1..K has the loss of
 one-step training, in the same normalised quantities, against the answer that leads from the predicted state to the
 recording:
 
@@ -130,10 +130,11 @@ class UnrolledObjective(nn.Module):
                 vertices, compose(output, newest, residual=config.residual), features, body
             )
             if self.unroll.collision_passes:
-                solved = scene.push_out(solved, body, finite, scene.carried(vertices, features))[0]
+                origin = scene.contact.origin(vertices, features)
+                solved = scene.contact(solved, body, finite, origin, measure=False)[0]
             yield terms, solved, recorded
             if not last:
-                velocity = scene.components_mean(solved) - scene.components_mean(vertices)
+                velocity = scene.centroids(solved) - scene.centroids(vertices)
                 history = history.followed(stacked, velocity)
                 vertices = solved
                 features = scene.features(vertices, body, batch.bodies[k + 2])
@@ -144,7 +145,7 @@ class UnrolledObjective(nn.Module):
         scene = batch.scene
         phi = features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3).contiguous()
         phi_next = deformation_gradient_from_inverse(scene.inverse_rest, recorded, scene.packed.faces)
-        velocity = scene.components_mean(recorded) - scene.components_mean(vertices)
+        velocity = scene.centroids(recorded) - scene.centroids(vertices)
         return Step(relative_deformation_gradient(phi_next, phi), singular_values(phi_next), velocity)
 
     def _network(

@@ -10,15 +10,14 @@ from .scene import Scene
 
 def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     """Algorithm 1: frame t, and the bodies at t+1 [U,3], to frame t+1. Only a CPU looks at a number on the way."""
-    vertices = now.positions
-    features = scene.features(vertices, now.body, next_body)
+    before = now.positions
+    features = scene.features(before, now.body, next_body)
     stacked = now.history.stacked(features)
     step = scene.predict(stacked, now.velocities)
-    solved, finite = scene.reconstruct(vertices, step, features, next_body)
-    poisson = scene.poisson.summary()
-    origin = scene.carried(vertices, features) if scene.collision_passes else None
-    committed, finite, depth, collision = scene.push_out(solved, next_body, finite & now.finite, origin)
-    velocity = scene.components_mean(committed) - scene.components_mean(vertices)
-    history = now.history.followed(stacked, velocity)
-    solves = torch.stack([poisson, collision])
-    return Frame(committed, next_body, history.features, history.velocities, finite, depth, solves)
+    solved, finite = scene.reconstruct(before, step, features, next_body)
+    origin = scene.contact.origin(before, features)
+    pushed, finite, depth, report = scene.contact(solved, next_body, finite & now.finite, origin)
+    after, finite, depth = scene.correct(before, pushed, next_body, finite, depth)
+    history = now.history.followed(stacked, scene.centroids(after) - scene.centroids(before))
+    solves = torch.stack([scene.reconstruct.solver.summary(), report])
+    return Frame(after, next_body, history.features, history.velocities, finite, depth, solves)

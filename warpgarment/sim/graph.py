@@ -14,19 +14,18 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import warp as wp
 
-if TYPE_CHECKING:
-    from .frame import Frame
-    from .scene import Scene
+from .advance import advance
+from .frame import Frame
+from .scene import Scene
 
 WARM_UP = 3  # frames
 
-Advance = Callable[["Frame", torch.Tensor], "Frame"]
-Record = Callable[[Callable[[], "Frame"]], "tuple[Frame, Callable[[], None]]"]
+Record = Callable[[Callable[[], Frame]], tuple[Frame, Callable[[], None]]]
 
 
 def cuda_graph(run: Callable[[], Frame]) -> tuple[Frame, Callable[[], None]]:
@@ -51,16 +50,15 @@ def cuda_graph(run: Callable[[], Frame]) -> tuple[Frame, Callable[[], None]]:
 
 
 class GraphedFrames:
-    """Runs the frames of one scene, first as they are and then as replays.
+    """Runs `advance` for the frames of one scene, first as it is and then as replays.
 
     Args:
-        scene: Whose bodies a frame moves.
-        advance: Frame t and the bodies at t+1 to frame t+1; must not wait for the device.
-        record: As `cuda_graph`.
+        scene: The scene, whose bodies a frame moves.
+        record: Makes a recording, as `cuda_graph`.
     """
 
-    def __init__(self, scene: Scene, advance: Advance, record: Record = cuda_graph) -> None:
-        self.scene, self.advance, self.record = scene, advance, record
+    def __init__(self, scene: Scene, record: Record = cuda_graph) -> None:
+        self.scene, self.record = scene, record
         self.seen = 0
         self.failed = False
         self._recorded: tuple[Frame, torch.Tensor, Frame, Callable[[], None]] | None = None
@@ -70,14 +68,14 @@ class GraphedFrames:
         if self._recorded is None:
             self.seen += 1
             if self.failed or self.seen <= WARM_UP or not self._record(now, next_body):
-                return self.advance(now, next_body)
+                return advance(self.scene, now, next_body)
         assert self._recorded is not None
         before, body, after, replay = self._recorded
-        self.scene.bodies(now.body)
+        self.scene.bodies.at(now.body)
         for held, given in zip((*before, body), (*now, next_body), strict=True):
             held.copy_(given)
         replay()
-        self.scene.placed = next_body  # the graph has moved the bodies' search trees there
+        self.scene.bodies.placed = next_body  # the graph has moved the bodies' search trees there
         return type(now)(*(tensor.clone() for tensor in after))._replace(body=next_body)
 
     @property
@@ -87,11 +85,11 @@ class GraphedFrames:
 
     def _record(self, now: Frame, next_body: torch.Tensor) -> bool:
         before, body = type(now)(*(tensor.clone() for tensor in now)), next_body.clone()
-        self.scene.bodies(now.body)
-        self.scene.placed = before.body  # where a replay finds them
+        self.scene.bodies.at(now.body)
+        self.scene.bodies.placed = before.body  # where a replay finds them
         try:
             with torch.cuda.device_of(now.positions):  # nothing where that is no GPU
-                after, replay = self.record(lambda: self.advance(before, body))
+                after, replay = self.record(lambda: advance(self.scene, before, body))
         except Exception as error:  # whatever CUDA, torch or Warp refuse to capture
             self.failed = True
             reason = str(error).strip().splitlines() or [""]
@@ -103,6 +101,6 @@ class GraphedFrames:
             )
             return False
         finally:
-            self.scene.placed = None
+            self.scene.bodies.placed = None
         self._recorded = before, body, after, replay
         return True

@@ -27,6 +27,9 @@ from warpgarment.nn.rows import row_groups
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies
+from warpgarment.objects.sizes import Sizes
+
+from .stages.correct import Corrector
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes: rest frames, indices; sparse matrices and vectors of the solvers
@@ -70,6 +73,7 @@ def predict(
     face_splits: int = 1,
     half: bool = False,
     device: torch.device | str = "cpu",
+    correctors: Sequence[Corrector] = (),
 ) -> Memory:
     """What a batch takes at its peak, on its device.
 
@@ -79,19 +83,15 @@ def predict(
         config: Of the network.
         face_splits, half: As in `Simulator`.
         device: On a CPU, the distances that weights are made from count too.
+        correctors: What changes positions after contact; each is asked for its own memory.
 
     Returns:
         Bytes; nothing is computed over pairs of faces, and nothing allocated.
     """
     cpu = torch.device(device).type == "cpu"
     unique = list({id(garment): garment for garment in garments}.values())
-    faces = sum(len(garment.faces) for garment in garments)
-    vertices = sum(len(garment.vertices) for garment in garments)
-    if isinstance(bodies, PackedBodies):
-        body_vertices, body_faces = bodies.vertex_offsets[-1], bodies.face_offsets[-1]
-    else:
-        body_vertices = sum(b.vertices.shape[1] for b in bodies)
-        body_faces = sum(len(b.faces) for b in bodies)
+    sizes = Sizes.of(garments, bodies)
+    _, vertices, faces, body_vertices, body_faces = sizes
 
     groups = row_groups(garments, config, face_splits)
     patches = config.architecture == "patches"
@@ -143,6 +143,7 @@ def predict(
             "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
             peak: passing[peak],
         }
+        | {f"{c.name}, {purpose}": count for c in correctors for purpose, count in c.memory(sizes).items()}
     )
 
 
@@ -167,6 +168,7 @@ def check(
     face_splits: int = 1,
     half: bool = False,
     device: torch.device | str = "cpu",
+    correctors: Sequence[Corrector] = (),
 ) -> None:
     """Refuses a batch that will not fit, before its memory is taken. Arguments as in `predict`.
 
@@ -179,7 +181,8 @@ def check(
     limit = int(USABLE * available)
 
     def needs(number: int = len(garments), splits: int = face_splits, halved: bool = half) -> Memory:
-        return predict(garments[:number], bodies, config, face_splits=splits, half=halved, device=device)
+        given = garments[:number]
+        return predict(given, bodies, config, face_splits=splits, half=halved, device=device, correctors=correctors)
 
     needed = needs()
     if needed.total <= limit:

@@ -27,7 +27,7 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
     """Reads frames from the device, all in one go, and warns of solves that did not converge.
 
     Args:
-        scene: Theirs.
+        scene: The scene that the frames belong to.
         first: Number of the first frame.
         frames: `Frame.outcome` of this and the following frames.
     """
@@ -38,7 +38,7 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
         for part, sound in zip(parts, finite[k], strict=True):
             if not sound:
                 part[:] = np.nan
-        scene.tell(solves[k])
+        _warn_if_stopped(scene, solves[k])
         iterations = [int(n) for n in solves[k, :, 0]]
         judged = zip(finite[k], depth[k], strict=True)
         statuses = [RolloutStatus.judged(first + k, bool(f), float(d), *iterations) for f, d in judged]
@@ -46,11 +46,18 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
     return found
 
 
+def _warn_if_stopped(scene: Scene, solves: np.ndarray) -> None:
+    """Warns of solves that stopped at their limit; `solves` [2,3] as in `Frame`, read from the device."""
+    for solver, (_, stopped, error) in zip((scene.reconstruct.solver, scene.contact.solver), solves, strict=True):
+        if solver is not None:
+            solver.warn_if_stopped(stopped, error)
+
+
 class Recording:
     """What a rollout keeps of its frames, read from the device some frames at a time.
 
     Args:
-        scene: Of the rollout.
+        scene: The scene of the rollout.
         lengths: Frames of each garment; later ones are not kept, nor what follows a frame that is not finite.
         every: Frames that are read together.
     """

@@ -6,7 +6,6 @@ and one garment is a batch of one.
 
 from __future__ import annotations
 
-import functools
 import os
 import warnings
 from collections.abc import Sequence
@@ -16,6 +15,8 @@ import numpy as np
 import torch
 
 from warpgarment.errors import MeshError
+from warpgarment.kernels.collision.body_contacts import BodyContacts
+from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.nn import checkpoint
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.body import BodyMotion
@@ -31,6 +32,7 @@ from .graph import GraphedFrames
 from .history import History
 from .recording import READ_EVERY, Recording
 from .scene import Scene
+from .stages.correct import Corrector
 from .state import SimulationState, Status, Vertices
 from .timing import Timings
 
@@ -52,6 +54,9 @@ class Simulator:
     Attributes:
         timings: Seconds per stage since the simulator was made: a dict, plus `synchronise`, which must be set for it to
             be filled on CUDA.
+        contact_sources: What finds contacts in the simulations that are started from now on: a list, at first
+            `[BodyContacts()]`.
+        correctors: What changes positions after contact, in order: a list, empty at first.
     """
 
     def __init__(
@@ -75,6 +80,8 @@ class Simulator:
         self.network = network.to(self.device)
         self.epsilon, self.collision_passes, self.half = epsilon, int(collision_passes), half
         self.timings = Timings(self.device)
+        self.contact_sources: list[ContactSource] = [BodyContacts()]
+        self.correctors: list[Corrector] = []
 
     @classmethod
     def from_pretrained(
@@ -298,23 +305,24 @@ class Simulator:
             collision_passes=self.collision_passes,
             half=self.half,
             timings=self.timings,
+            contact_sources=self.contact_sources,
+            correctors=self.correctors,
         )
         history_length = self.network.config.history
         features = scene.features(known[0], body_frames[0], body_frames[0])
         history = History.cold(features, scene.packed.component_count, history_length)
-        if self.graph:
-            scene.graph = GraphedFrames(scene, functools.partial(advance, scene))
+        graph = GraphedFrames(scene) if self.graph else None
         finite = torch.ones(len(garments), dtype=torch.bool, device=self.device)
         unsolved = torch.zeros((2, 3), dtype=torch.float64, device=self.device)
         states: list[SimulationState[Any, Any]] = []
         for frame, (vertices, body) in enumerate(zip(known, body_frames, strict=True)):
             if frame:
                 features = scene.features(known[frame - 1], body_frames[frame - 1], body)
-                velocity = scene.components_mean(vertices) - scene.components_mean(known[frame - 1])
+                velocity = scene.centroids(vertices) - scene.centroids(known[frame - 1])
                 history = history.followed(history.stacked(features), velocity)
-            depth = scene.depth(vertices, scene.bodies(body))
+            depth = scene.contact.depth(vertices, body)
             now = Frame(vertices, body, history.features, history.velocities, finite, depth, unsolved)
-            states.append(SimulationState(scene, single, frame, now))
+            states.append(SimulationState(scene, single, frame, now, graph))
         return states
 
     @torch.inference_mode()
@@ -322,11 +330,11 @@ class Simulator:
         self, state: SimulationState[Vertices, Status], next_body: torch.Tensor
     ) -> SimulationState[Vertices, Status]:
         scene = state.scene
-        if scene.graph is None or self.timings.synchronise:
+        if state.graph is None or self.timings.synchronise:
             after = advance(scene, state.now, next_body)
         else:
-            after = scene.graph(state.now, next_body)
-        return SimulationState(scene, state.single, state.frame + 1, after)
+            after = state.graph(state.now, next_body)
+        return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
 
     def _known(self, garments: list[Garment], single: bool, first: Any, history: Any) -> torch.Tensor:
         frames = known_frames(garments, single, first, history, self.network.config.history)

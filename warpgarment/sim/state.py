@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 from .frame import Frame
+from .graph import GraphedFrames
 from .recording import Outcome, read
 from .scene import Scene
 
@@ -32,6 +33,7 @@ class SimulationState(Generic[Vertices, Status]):
     single: bool  # one garment, not a list
     frame: int
     now: Frame
+    graph: GraphedFrames | None = None  # replays frames, for all states of a `start`
 
     @property
     def vertices(self) -> Vertices:

@@ -18,8 +18,8 @@ from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
-from warpgarment.sim import differentiable
 from warpgarment.sim.simulator import Simulator
+from warpgarment.sim.stages import features
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
 from warpgarment.training.samples import interactions
@@ -134,7 +134,7 @@ def test_gradients_are_those_of_finite_differences(loaded, network, monkeypatch,
     2 %. 0.5 % of the slope: the loss is curved, and float32 positions, 1e-7 m off, limit differences to some 1e-3.
     Frames in which no two singular values of a face meet: replacing them is discontinuous there.
     """
-    found, calls, search = [], [], differentiable.body_interaction
+    found, calls, search = [], [], features.body_interaction
 
     def remembered(*arguments):
         calls.append(None)
@@ -148,7 +148,7 @@ def test_gradients_are_those_of_finite_differences(loaded, network, monkeypatch,
         terms = [((a.double() - b.double()).square().sum(dim=-1) * w).sum() for a, b, w in parts]
         return sum(f * term for f, term in zip(factors, terms, strict=True)), *terms
 
-    monkeypatch.setattr(differentiable, "body_interaction", remembered)
+    monkeypatch.setattr(features, "body_interaction", remembered)
     monkeypatch.setattr(unroll, "weighted", squares)
     batch = batch_of(loaded, network, [(0, T + 1), (1, T + 1)])
     objective, parameters = objective_of(network, position=1.0), list(network.parameters())

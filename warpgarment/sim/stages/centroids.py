@@ -1,0 +1,28 @@
+"""The mean face centroid of each connected component: z of the paper, whose change from frame to frame is q."""
+
+from __future__ import annotations
+
+import torch
+
+from warpgarment.kernels.deformation.face_means import FaceMeans
+from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
+from warpgarment.objects.pack import PackedGarments
+
+
+class ComponentCentroids:
+    """Mean face centroids of the components of a batch.
+
+    Args:
+        packed: The batch.
+    """
+
+    def __init__(self, packed: PackedGarments) -> None:
+        self._packed = packed
+        self._means = FaceMeans(packed.faces, packed.face_component, packed.component_count, len(packed.rest_vertices))
+
+    def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
+        """Positions [V,3] -> centroids [C,3], in metres; differentiable in positions that require a gradient."""
+        if vertices.requires_grad:
+            packed = self._packed
+            return segment_mean(face_centroids(vertices, packed.faces), packed.face_component, packed.component_count)
+        return self._means(vertices)

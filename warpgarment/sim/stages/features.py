@@ -1,0 +1,85 @@
+"""Step 1 of a frame: the features of each face, which the network reads."""
+
+from __future__ import annotations
+
+import torch
+
+from warpgarment.kernels.deformation.face_means import FaceMeans
+from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
+from warpgarment.kernels.features.face import BodyInteraction, body_interaction, face_features, frame_features
+from warpgarment.objects.pack import PackedGarments
+from warpgarment.sim.bodies import MovingBodies
+from warpgarment.sim.timing import Timings
+
+
+class Features:
+    """Features of the faces of a batch.
+
+    Args:
+        packed: The batch.
+        inverse_rest: Inverse rest frames of the faces, see `inverse_rest_frames`, shape [F,3,3].
+        body_of_face: Body of each face, int32 [F].
+        bodies: The bodies.
+        timings: Where the stage adds up how long it took, as "features".
+    """
+
+    def __init__(
+        self,
+        packed: PackedGarments,
+        inverse_rest: torch.Tensor,
+        body_of_face: torch.Tensor,
+        bodies: MovingBodies,
+        timings: Timings,
+    ) -> None:
+        self._packed, self._inverse_rest, self._body_of_face = packed, inverse_rest, body_of_face
+        self._bodies, self._timings = bodies, timings
+        self._means = FaceMeans(packed.faces, packed.garment_of_face, packed.count, len(packed.rest_vertices))
+
+    def __call__(self, vertices: torch.Tensor, body: torch.Tensor, next_body: torch.Tensor) -> torch.Tensor:
+        """Features of frame t.
+
+        In one launch; or, where the positions require a gradient, operator by operator, with the nearest body face of
+        each face held fixed.
+
+        Args:
+            vertices: Garments at t [m], shape [V,3].
+            body: Bodies at t [m], shape [U,3].
+            next_body: Bodies at t+1 [m], shape [U,3].
+
+        Returns:
+            Features, shape [F,34].
+        """
+        packed = self._packed
+        with self._timings("features"):
+            bodies = self._bodies.at(body)
+            if vertices.requires_grad:
+                centroids = face_centroids(vertices, packed.faces)
+                interaction = body_interaction(centroids, self._body_of_face, bodies, next_body)
+                return self._from(vertices, centroids, interaction)
+            return frame_features(
+                self._inverse_rest,
+                vertices,
+                packed.faces,
+                packed.garment_of_face,
+                self._means(vertices),
+                self._body_of_face,
+                bodies,
+                next_body,
+            )
+
+    def of_interaction(self, vertices: torch.Tensor, interaction: BodyInteraction) -> torch.Tensor:
+        """Features of a frame whose nearest body faces are known already.
+
+        Args:
+            vertices: Garments [m], shape [V,3].
+            interaction: What `body_interaction` found for the faces.
+
+        Returns:
+            Features, shape [F,34].
+        """
+        return self._from(vertices, face_centroids(vertices, self._packed.faces), interaction)
+
+    def _from(self, vertices: torch.Tensor, centroids: torch.Tensor, interaction: BodyInteraction) -> torch.Tensor:
+        packed = self._packed
+        mean = segment_mean(centroids, packed.garment_of_face, packed.count)
+        return face_features(self._inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, interaction)
