@@ -56,6 +56,42 @@ def test_every_format_reads_back_bit_for_bit(tmp_path, target):
     assert not [p for p in tmp_path.rglob("*") if "partial" in p.name]
 
 
+@pytest.mark.parametrize("target", ["m.npz", "m.usd", "m.usda", "m.usdc", "m.pc2", "folder"])
+def test_a_garment_motion_reads_back_what_it_saved(tmp_path, target):
+    """A result that was written for another program cannot be measured any more: bit for bit, with the rate where the
+    format has one, and in another unit or at another rate where asked."""
+    result = motion(frames=12)
+    result.save(tmp_path / target)
+    back = wg.GarmentMotion.load(tmp_path / target)
+    np.testing.assert_array_equal(back.vertices, result.vertices)
+    np.testing.assert_array_equal(back.faces, result.faces)
+    assert back.fps == (24.0 if target not in ("m.pc2", "folder") else 30.0)
+    kept = (result.status, "shirt") if target == "m.npz" else ([], target.partition(".")[0])
+    assert (back.status, back.name) == kept
+    back.save(tmp_path / f"again_{target}")
+    small = wg.GarmentMotion.load(tmp_path / target, unit="cm", fps=12)
+    np.testing.assert_allclose(small.vertices, result.vertices / 100, rtol=1e-6)
+    assert small.fps == 12.0
+
+
+@pytest.mark.parametrize("target", ["m.npz", "m.usdc", "m.pc2", "folder"])
+def test_a_rollout_that_failed_reads_back(tmp_path, target):
+    """A result that ends in NaN, as one that went wrong does, can be written but not read."""
+    result = motion()
+    result.vertices[4] = np.nan
+    result.save(tmp_path / target)
+    np.testing.assert_array_equal(wg.GarmentMotion.load(tmp_path / target).vertices, result.vertices)
+
+
+def test_what_is_no_motion_is_named(tmp_path):
+    """A wrong path ends in another library's traceback."""
+    (tmp_path / "m.pc2").write_bytes(b"POINTCACHE2")
+    (tmp_path / "m.txt").write_text("")
+    for name, error in (("m.pc2", wg.MeshError), ("m.txt", wg.MeshError), ("none.usd", FileNotFoundError)):
+        with pytest.raises(error, match=name.replace(".", r"\.")):
+            wg.GarmentMotion.load(tmp_path / name)
+
+
 def test_pc2_bytes_are_those_of_the_format(tmp_path):
     """Blender would not read the cache: signature, version, counts and order, unpacked by hand."""
     result = motion()
@@ -158,10 +194,10 @@ def test_a_write_that_stops_midway_leaves_nothing(tmp_path, monkeypatch):
         calls.append(1)
         return _fail() if len(calls) == 3 else real(*args)
 
-    monkeypatch.setattr("warpgarment.io.sequence.obj_text", text)
+    monkeypatch.setattr("warpgarment.io.folder.obj_text", text)
     with pytest.raises(OSError, match="disk full"):
         motion().save(tmp_path / "folder")
-    monkeypatch.setattr("warpgarment.io.sequence.write_pc2_to", _fail)
+    monkeypatch.setattr("warpgarment.io.pc2.write_pc2_to", _fail)
     with pytest.raises(OSError, match="disk full"):
         motion().save(tmp_path / "m.pc2")
     monkeypatch.setattr(np, "savez", _fail)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import numpy as np
 
 from warpgarment.errors import MeshError
 
+from .atomic import atomic_file
+from .data import Format, MeshData, ReadOptions
 from .polygons import triangulate_counts
 
 TYPES = {
@@ -165,3 +167,18 @@ def _collect(element: _Element, take: Callable[..., np.ndarray]) -> dict[str, Co
         sizes = np.array([len(row) for row in rows[name]], dtype=np.int64)
         table[name] = values if length is None else (sizes, values)
     return table
+
+
+def _read(path: Path, options: ReadOptions) -> MeshData:
+    return MeshData(*read_ply(path))
+
+
+def _write(path: Path, data: MeshData) -> None:
+    import trimesh
+
+    content = cast(bytes, trimesh.Trimesh(data.vertices, data.faces, process=False).export(file_type="ply"))
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(content)
+
+
+FORMAT = Format(read_mesh=_read, write_mesh=_write)

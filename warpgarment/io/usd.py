@@ -13,6 +13,7 @@ from warpgarment.errors import MeshError, MissingExtra
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
 
 from .atomic import atomic_file
+from .data import Format, MeshData, MotionData, ReadOptions
 from .polygons import triangulate_counts
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -175,3 +176,24 @@ def _world_points(geometry, UsdGeom, time) -> np.ndarray:
     points = np.array(geometry.GetPointsAttr().Get(time) or [], dtype=np.float64).reshape(-1, 3)
     matrix = np.array(UsdGeom.Imageable(geometry).ComputeLocalToWorldTransform(time))
     return points @ matrix[:3, :3] + matrix[3, :3]
+
+
+def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
+    found = read_usd(path, mesh=options.mesh, frames=False, convert=options.unit is None)
+    return MeshData(found.vertices[0], found.faces)
+
+
+def _write_mesh(path: Path, data: MeshData) -> None:
+    write_usd(path, [(data.name or "garment", np.asarray(data.vertices)[None], data.faces)], 30.0)
+
+
+def _read_motion(path: Path, options: ReadOptions) -> MotionData:
+    found = read_usd(path, mesh=options.mesh, convert=options.unit is None)
+    return MotionData(found.vertices, found.faces, found.fps, name=found.name)
+
+
+def _write_motion(path: Path, data: MotionData) -> None:
+    write_usd(path, [(data.name or "mesh", data.vertices, data.faces)], 30.0 if data.fps is None else data.fps)
+
+
+FORMAT = Format("usd", _read_mesh, _write_mesh, _read_motion, _write_motion, only_read=(".usdz",))

@@ -104,10 +104,10 @@ class BodyMotion:
             MeshError: The file is not of its kind or truncated, arrays do not fit each other, or as the constructor.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.sequence import read_sequence
+        from warpgarment.io.files import read_motion
 
         path = Path(path)
-        data = read_sequence(path, unit=unit, mesh=mesh)
+        data = read_motion(path, unit=unit, mesh=mesh)
         rate = fps if fps is not None else data.fps if data.fps is not None else 30.0
         try:
             motion = cls(data.vertices, data.faces, rate)
@@ -117,9 +117,10 @@ class BodyMotion:
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes .npz, .usd (.usda, .usdc), .pc2 with .obj beside it, or a folder of .obj; completely or not at all."""
-        from warpgarment.io.sequence import write_sequence
+        from warpgarment.io.data import MotionData
+        from warpgarment.io.files import write_motion
 
-        write_sequence(Path(path), self.vertices, self.faces, self.fps, name=Path(path).stem or "body")
+        write_motion(Path(path), MotionData(self.vertices, self.faces, self.fps, name=Path(path).stem or "body"))
 
     def resampled(self, fps: float) -> BodyMotion:
         """The motion at another rate, positions interpolated linearly in time.

@@ -89,7 +89,7 @@ class Garment:
         Warns:
             UserWarning: The garment is bigger than 10 m or smaller than 5 cm, so its unit is probably another.
         """
-        from warpgarment.io.mesh import read_mesh
+        from warpgarment.io.files import read_mesh
 
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh)
@@ -101,9 +101,10 @@ class Garment:
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes .obj, .ply, .npz or .usd (.usda, .usdc), completely or not at all. Pins are kept in .npz only."""
-        from warpgarment.io.mesh import write_mesh
+        from warpgarment.io.data import MeshData
+        from warpgarment.io.files import write_mesh
 
-        write_mesh(Path(path), self.vertices, self.faces, pins=self.pins, name=self.name)
+        write_mesh(Path(path), MeshData(self.vertices, self.faces, self.pins, self.name))
 
     @classmethod
     def cleaned_from(cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "") -> Garment:

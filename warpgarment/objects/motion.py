@@ -55,7 +55,7 @@ class GarmentMotion:
     def save(self, path: str | os.PathLike) -> None:
         """Writes the motion, completely or not at all.
 
-        - ``.npz``: positions, faces, rate and status; `load` reads it back without loss;
+        - ``.npz``: positions, faces, rate, status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample a frame (extra ``usd``), Y up, metres;
         - ``.pc2``: Blender's and others' point cache, with the first frame as ``.obj`` of the same name beside it;
         - no suffix: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is replaced if it
@@ -69,33 +69,45 @@ class GarmentMotion:
             FileExistsError: The folder holds files that are not frames.
             MissingExtra: USD without ``pip install "warpgarment[usd]"``.
         """
-        from warpgarment.io.sequence import write_sequence
+        from warpgarment.io.data import MotionData
+        from warpgarment.io.files import write_motion
 
-        write_sequence(
-            Path(path), self.vertices, self.faces, self.fps, name=self.name or "garment", extra=self._status_arrays()
-        )
+        name, extra = self.name or "garment", self._status_arrays()
+        write_motion(Path(path), MotionData(self.vertices, self.faces, self.fps, name=name, extra=extra))
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> GarmentMotion:
-        """Reads what `save` wrote as .npz.
+    def load(
+        cls, path: str | os.PathLike, *, unit: str | None = None, fps: float | None = None, mesh: str | None = None
+    ) -> GarmentMotion:
+        """Reads what `save` wrote, in any of its formats; only .npz keeps the statuses and the name.
+
+        Args:
+            path: File or folder.
+            unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that USD files
+                are converted by their own `metersPerUnit` and `upAxis`.
+            fps: Overrides the file's rate; 30 where neither says, as .pc2 and folders of .obj do not.
+            mesh: Name of the mesh to read where a USD file holds several.
 
         Raises:
             MeshError: Not such a file.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.npz import read_npz
+        from warpgarment.io.files import read_motion
 
         path = Path(path)
-        data = read_npz(path, required=("vertices", "faces", "fps"))
+        data = read_motion(path, unit=unit, mesh=mesh)
+        if path.suffix.lower() == ".npz" and data.fps is None and fps is None:
+            raise MeshError(f"{path}: no array named 'fps'; it is not what GarmentMotion.save writes. Give fps=.")
+        rate = fps if fps is not None else data.fps if data.fps is not None else 30.0
         try:
             status: list[RolloutStatus] = []
-            if "status_finite" in data:
-                verdicts = [Verdict(str(v)) for v in data["status_verdict"]]
-                columns = [data[f"status_{key}"].tolist() for key in _STATUS]
+            if "status_finite" in data.extra:
+                verdicts = [Verdict(str(v)) for v in data.extra["status_verdict"]]
+                columns = [data.extra[f"status_{key}"].tolist() for key in _STATUS]
                 rows = zip(*columns, verdicts, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
-            name = str(data["name"]) if "name" in data else path.stem
-            return cls(data["vertices"], data["faces"], float(data["fps"]), status, name)
+            name = str(data.extra["name"]) if "name" in data.extra else path.stem
+            return cls(data.vertices, data.faces, rate, status, name)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
 

@@ -36,6 +36,8 @@ from warpgarment.training.teachers.scenes import check_scenes
 from .settings import NewtonSettings, layer_friction
 from .worlds import Worlds
 
+LAYER_FRICTION = 0.2  # between cloths: Newton has one coefficient for all worlds it simulates at once
+
 
 class NewtonTeacher:
     """Simulates cloth with Newton's VBD solver (extra `physics`).
@@ -167,3 +169,8 @@ class NewtonTeacher:
                     found[w] = np.full_like(vertices, np.nan)
             if frame >= settle:
                 yield found
+
+
+def make(device: str | None) -> NewtonTeacher:
+    """The teacher as `generate` uses it; see `teachers.make_teacher`."""
+    return NewtonTeacher(NewtonSettings(layer_friction=LAYER_FRICTION), device=device)
