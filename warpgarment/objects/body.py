@@ -20,6 +20,8 @@ from warpgarment.geometry.checks import (
 )
 from warpgarment.geometry.orientation import turned_outward
 
+MOST_BETWEEN, LARGEST = 100, 1 << 30  # new frames for each old one, and bytes, that resampling makes at most
+
 
 class BodyMotion:
     """A deforming triangle mesh that a garment collides with.
@@ -122,22 +124,28 @@ class BodyMotion:
 
         write_motion(Path(path), MotionData(self.vertices, self.faces, self.fps, name=Path(path).stem or "body"))
 
-    def resampled(self, fps: float) -> BodyMotion:
+    def resampled(self, fps: float, frames: int | None = None) -> BodyMotion:
         """The motion at another rate, positions interpolated linearly in time.
 
         Starts at the first frame and lasts as long as whole frames fit: floor((T - 1) fps' / fps) + 1 frames.
 
         Args:
             fps: New frames per second.
+            frames: No more than so many of the new frames; None: all.
 
         Raises:
-            MeshError: The rate is not positive.
+            MeshError: The rate is not positive, or so much higher than the motion's that the frames would fill memory.
         """
         fps = checked_fps(fps)
         if fps == self.fps:
             return self
         last = self.frames - 1
-        count = int(np.floor(last * fps / self.fps + 1e-6)) + 1
+        count = int(min(np.floor(last * fps / self.fps + 1e-6) + 1, frames or np.inf, 2**62))
+        if count > MOST_BETWEEN * self.frames and 12 * count * self.vertices.shape[1] > LARGEST:
+            raise MeshError(
+                f"{self.frames:,} frames at {self.fps:g} a second would be {count:,} at {fps:g}: more than "
+                f"{LARGEST:,} bytes. Is the rate right? Give it with fps=."
+            )
         time = np.minimum(np.arange(count) * (self.fps / fps), last)
         before = np.minimum(time.astype(np.int64), max(last - 1, 0))
         share = (time - before).astype(np.float32)[:, None, None]
