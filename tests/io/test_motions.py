@@ -194,10 +194,10 @@ def test_a_write_that_stops_midway_leaves_nothing(tmp_path, monkeypatch):
         calls.append(1)
         return _fail() if len(calls) == 3 else real(*args)
 
-    monkeypatch.setattr("warpgarment.io.sequence.obj_text", text)
+    monkeypatch.setattr("warpgarment.io.folder.obj_text", text)
     with pytest.raises(OSError, match="disk full"):
         motion().save(tmp_path / "folder")
-    monkeypatch.setattr("warpgarment.io.sequence.write_pc2_to", _fail)
+    monkeypatch.setattr("warpgarment.io.pc2.write_pc2_to", _fail)
     with pytest.raises(OSError, match="disk full"):
         motion().save(tmp_path / "m.pc2")
     monkeypatch.setattr(np, "savez", _fail)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpgarment.training.teachers import TEACHERS
 from warpgarment.view import markdown
 
 from .layout import SPLITS
@@ -26,7 +27,6 @@ _CREDITS = {
     "other": "**Other motions** are from files of whoever made this set; their licences are not known here.",
     "procedural": "**Procedural motions**: made by formulas of warpgarment.",
 }
-_TEACHERS = {"newton": "simulated with Newton (Apache-2.0)", "blender": "simulated with Blender (GPL; not its output)"}
 
 
 def page(facts: Facts, drawn: Mapping[str, Values], reasons: Counter[str]) -> str:
@@ -164,7 +164,7 @@ def credits(facts: Facts) -> list[str]:
         "procedural": procedural,
     }
     teacher = facts.common.get("configuration", {}).get("teacher")
-    simulated = f", {_TEACHERS[teacher]}" if teacher in _TEACHERS else ""
+    simulated = f", simulated with {TEACHERS[teacher].credit}" if teacher in TEACHERS else ""
     lines = [f"- {_CREDITS[key]}" for key, used in named.items() if used]
     return [*lines, f"- **Garments and simulations**: made by warpgarment (Apache-2.0){simulated}."]
 

@@ -10,9 +10,11 @@ from typing import Any
 
 from warpgarment.errors import MeshError
 from warpgarment.io.atomic import atomic_file
+from warpgarment.training.teachers import TEACHERS
 
 SET_MANIFEST = "set.json"
-PACKAGES = ("warpgarment", "newton", "warp-lang", "anny", "numpy", "scipy", "libigl", "gpytoolbox")
+_SIMULATE = dict.fromkeys(package for teacher in TEACHERS.values() for package in teacher.packages)
+PACKAGES = ("warpgarment", *_SIMULATE, "anny", "numpy", "scipy", "libigl", "gpytoolbox")
 
 
 class DatasetMismatch(ValueError):

@@ -16,8 +16,8 @@ from typing import cast
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.io.mesh import read_mesh
-from warpgarment.io.sequence import SequenceData, read_sequence
+from warpgarment.io.data import MotionData
+from warpgarment.io.files import read_mesh, read_motion
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.material import Material
 
@@ -101,9 +101,9 @@ def _split(source: Source) -> tuple[Path, str | None]:
     return (Path(source[0]), source[1]) if isinstance(source, tuple) else (Path(source), None)
 
 
-def _read(source: Source, unit: str | None, rates: dict[str, float]) -> tuple[Path, str, SequenceData]:
+def _read(source: Source, unit: str | None, rates: dict[str, float]) -> tuple[Path, str, MotionData]:
     path, mesh = _split(source)
-    data = read_sequence(path, unit=unit, mesh=mesh)
+    data = read_motion(path, unit=unit, mesh=mesh)
     name = mesh.rsplit("/", 1)[-1] if mesh else path.stem
     if data.fps is not None:
         rates[f"{path.name}{f' ({mesh})' if mesh else ''}"] = float(data.fps)

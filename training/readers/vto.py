@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.io.mesh import read_mesh
+from warpgarment.io.files import read_mesh
 from warpgarment.io.npz import read_npz, write_npz
 
 from .recording import Recording, recorded_garment

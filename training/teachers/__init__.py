@@ -5,22 +5,45 @@
         ...
 
 `newton` (Newton's VBD, extra `physics`) runs in this process; `blender` runs Blender's cloth through `bpy` in a virtual
-environment of its own, as a subprocess.
+environment of its own, as a subprocess. `TEACHERS` names the module of each, which is imported when it is used.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 
-TEACHERS = ("newton", "blender")
-LAYER_FRICTION = 0.2  # between cloths: Newton has one coefficient for all worlds it simulates at once
+
+class TeacherEntry(NamedTuple):
+    """What can be said of a teacher without importing it.
+
+    Attributes:
+        module: Has `make(device: str | None) -> Teacher`; the device is Warp's, None its default.
+        extra: The extra of this package that brings what it needs; None: something else does, or nothing is needed.
+        packages: Packages of this environment whose versions its results depend on.
+        credit: Whose work it is, and under which licence, after "simulated with".
+    """
+
+    module: str
+    extra: str | None
+    packages: tuple[str, ...]
+    credit: str
+
+
+# The command line's choices are written out in `GenerateConfig.teacher`. docs/extending_files.md adds one.
+TEACHERS: dict[str, TeacherEntry] = {
+    "newton": TeacherEntry(
+        "warpgarment.training.teachers.newton.teacher", "physics", ("newton", "warp-lang"), "Newton (Apache-2.0)"
+    ),
+    "blender": TeacherEntry("warpgarment.training.teachers.blender.teacher", None, (), "Blender (GPL; not its output)"),
+}
 
 
 @dataclass(frozen=True)
@@ -107,22 +130,18 @@ class TeacherError(RuntimeError):
     """A physics teacher could not run, or failed on the way."""
 
 
-def make_teacher(name: Literal["newton", "blender"], device: str | None = "cpu") -> Teacher:
+def make_teacher(name: str, device: str | None = "cpu") -> Teacher:
     """A teacher by name.
+
+    Args:
+        name: A key of `TEACHERS`.
+        device: Warp device, such as "cpu" or "cuda:0", of teachers that run in this process; None: Warp's default.
 
     Raises:
         ValueError: Unknown name.
         MissingExtra: What it needs is not installed.
         TeacherError: Blender's environment has not been made.
     """
-    if name == "newton":
-        from warpgarment.training.teachers.newton.settings import NewtonSettings
-        from warpgarment.training.teachers.newton.teacher import NewtonTeacher
-
-        return NewtonTeacher(NewtonSettings(layer_friction=LAYER_FRICTION), device=device)
-    if name == "blender":
-        from warpgarment.training.teachers.blender.teacher import BlenderTeacher
-        from warpgarment.training.teachers.blender.units import LAYERED
-
-        return BlenderTeacher(LAYERED)
-    raise ValueError(f"unknown teacher {name!r}; there are {', '.join(TEACHERS)}")
+    if name not in TEACHERS:
+        raise ValueError(f"unknown teacher {name!r}; there are {', '.join(TEACHERS)}")
+    return importlib.import_module(TEACHERS[name].module).make(device)

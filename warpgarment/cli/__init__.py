@@ -121,9 +121,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-MOTION_FORMATS = (".usd", ".usda", ".usdc", ".pc2", ".npz", "")
-
-
 def check_output(path: Path, suffixes: Sequence[str]) -> None:
     """Refuses a file name that cannot be written, before time is spent on what goes into it."""
     if path.suffix.lower() not in suffixes:

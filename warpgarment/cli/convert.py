@@ -7,9 +7,10 @@ from pathlib import Path
 
 import tyro
 
+from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 
-from . import MOTION_FORMATS, check_output
+from . import check_output
 
 
 @dataclass
@@ -30,7 +31,7 @@ class Convert:
 
 def run(options: Convert) -> None:
     """Reads, resamples if asked, writes."""
-    check_output(options.output, MOTION_FORMATS)
+    check_output(options.output, suffixes("write_motion"))
     motion = BodyMotion.load(options.input, unit=options.unit, mesh=options.mesh, collider=False)
     if options.fps is not None:
         motion = motion.resampled(options.fps)

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import tyro
 
+from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.view.report import rollout_table
 
-from . import MOTION_FORMATS, check_output
+from . import check_output
 
 
 @dataclass
@@ -43,7 +44,7 @@ class Simulate:
 
 def run(options: Simulate) -> None:
     """Loads, fits if asked, rolls out, writes, and says how it went."""
-    check_output(options.out, MOTION_FORMATS)
+    check_output(options.out, suffixes("write_motion"))
     from warpgarment.sim.simulator import Simulator
 
     garment = Garment.load(options.garment, unit=options.unit)

@@ -2,49 +2,90 @@
 
 from __future__ import annotations
 
+import math
+import struct
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.geometry.skinning import linear_blend_skinning
 
 from .atomic import atomic_file
+from .data import Format, MeshData, MotionData, ReadOptions
+
+MAGIC = b"\x93NUMPY"
+LARGE, RATIO = 64 << 20, 100  # bytes of an array from which on it is asked how much smaller it is in the file
+SKINNED = ("rest_vertices", "faces", "bone_indices", "bone_weights", "bone_transforms")
 
 
-def read_npz(path: Path, required: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """All arrays of an archive.
+def read_npz(
+    path: Path, required: Sequence[str] = (), wanted: Callable[[str], bool] | None = None
+) -> dict[str, np.ndarray]:
+    """Arrays of an archive. Sizes are checked before anything is allocated for them.
 
     Args:
         path: The file.
         required: Names that must be there.
+        wanted: Which names to read; others are not even unpacked. None: all.
 
     Raises:
-        MeshError: Not an archive, cut short, holding pickled objects, or without a required array.
+        MeshError: Not an archive, cut short, holding pickled objects or records, an array of another size than its
+            header says or than a file like this can hold, or without a required array.
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
+    with open(path, "rb") as file:
+        if file.read(len(MAGIC)) == MAGIC:
+            raise MeshError(f"{path} is a single array, not an .npz archive.")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise MeshError(f"{path} is a single array, not an .npz archive.")
-            data = {key: archive[key] for key in archive.files}
-    except FileNotFoundError:
-        raise
-    except MeshError:
-        raise
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, TypeError, AttributeError):
+        with zipfile.ZipFile(path) as archive:
+            members = {m.filename.removesuffix(".npy"): m for m in archive.infolist()}
+            missing = [key for key in required if key not in members]
+            if missing:
+                names = ", ".join(sorted(members)) or "nothing"
+                raise MeshError(f"{path}: no array named {missing[0]!r}; the file holds {names}.")
+            return {key: _array(path, archive, m) for key, m in members.items() if wanted is None or wanted(key)}
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, struct.error) as error:
+        if isinstance(error, MeshError):
+            raise
         raise MeshError(
             f"{path}: not a readable .npz archive of plain arrays. It is damaged, cut short, or of another kind."
         ) from None
-    missing = [key for key in required if key not in data]
-    if missing:
+
+
+def _array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """One array; whatever the libraries underneath make of a damaged one becomes a MeshError."""
+    name = member.filename
+    if member.file_size > max(LARGE, RATIO * member.compress_size):
         raise MeshError(
-            f"{path}: no array named {missing[0]!r}; the file holds {', '.join(sorted(data)) or 'nothing'}."
+            f"{path}: {name} would unpack {member.compress_size:,} bytes into {member.file_size:,}; above "
+            f"{LARGE:,} bytes, arrays that shrink to less than a {RATIO}th are refused. Save it without compression."
         )
-    return data
+    try:
+        with archive.open(member) as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, by_columns, dtype = read(file)
+            header = file.tell()
+            if dtype.hasobject or dtype.names or dtype.itemsize == 0:
+                raise ValueError("pickled objects or records")
+            size = dtype.itemsize * math.prod(shape)
+            if size != member.file_size - header or min(shape, default=0) < 0:
+                raise ValueError(f"shape {list(shape)} where there are {member.file_size - header:,} bytes")
+            data = bytearray(size)
+            if cast(BufferedIOBase, file).readinto(data) != size or file.read(1):
+                raise ValueError("cut short")
+    except Exception as error:  # zlib.error, TokenError, SyntaxError, RuntimeError, ...: there is no end of them
+        raise MeshError(
+            f"{path}: {name} is not a readable plain array ({type(error).__name__}: {str(error)[:100]}). "
+            "The file is damaged, cut short, or of another kind."
+        ) from None
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -55,3 +96,50 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     named: dict[str, Any] = dict(arrays)  # Any: NumPy's stub would have each of them fit `allow_pickle` too
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **named)
+
+
+def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
+    arrays = read_npz(path, ("vertices", "faces"), {"vertices", "faces", "pins", "name"}.__contains__)
+    return MeshData(arrays["vertices"], arrays["faces"], arrays.get("pins"), _name(arrays))
+
+
+def _read_motion(path: Path, options: ReadOptions) -> MotionData:
+    """Positions, or a rest mesh with bones that move it."""
+    known = {"vertices", "fps", "collider_faces", *SKINNED}
+    arrays = read_npz(path, ("faces",), lambda key: key in known or key == "name" or key.startswith("status_"))
+    if "vertices" in arrays:
+        vertices = arrays["vertices"]
+        vertices = vertices[None] if vertices.ndim == 2 else vertices
+    else:
+        missing = [key for key in SKINNED if key not in arrays]
+        if missing:
+            raise MeshError(
+                f"{path}: neither 'vertices' nor {missing[0]!r} in it; it holds {', '.join(sorted(arrays))}."
+            )
+        try:
+            vertices = linear_blend_skinning(*(arrays[k] for k in ("rest_vertices", *SKINNED[2:])))
+        except MeshError as error:
+            raise MeshError(f"{path}: {error}") from None
+    try:
+        fps = float(arrays["fps"]) if "fps" in arrays else None
+    except (TypeError, ValueError):
+        raise MeshError(f"{path}: fps must be a single number.") from None
+    extra = {key: array for key, array in arrays.items() if key not in known}
+    return MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
+
+
+def _name(arrays: Mapping[str, np.ndarray]) -> str:
+    return str(arrays["name"]) if "name" in arrays else ""
+
+
+def _write_mesh(path: Path, data: MeshData) -> None:
+    pins = {} if data.pins is None or len(data.pins) == 0 else {"pins": data.pins}
+    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **pins})
+
+
+def _write_motion(path: Path, data: MotionData) -> None:
+    rate = {} if data.fps is None else {"fps": np.array(data.fps, dtype=np.float64)}
+    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **rate, **data.extra})
+
+
+FORMAT = Format(read_mesh=_read_mesh, write_mesh=_write_mesh, read_motion=_read_motion, write_motion=_write_motion)

@@ -14,6 +14,7 @@ import numpy as np
 from warpgarment.errors import MeshError
 
 from .atomic import atomic_file
+from .data import Format, MeshData, ReadOptions
 from .polygons import triangulate
 
 
@@ -111,7 +112,13 @@ def obj_text(vertices: np.ndarray, faces: np.ndarray, name: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray, name: str = "") -> None:
-    """Writes vertices [V,3] and faces [F,3] as OBJ, completely or not at all."""
+def _read(path: Path, options: ReadOptions) -> MeshData:
+    return MeshData(*read_obj(path))
+
+
+def _write(path: Path, data: MeshData) -> None:
     with atomic_file(path) as temporary:
-        temporary.write_text(obj_text(vertices, faces, name), encoding="utf-8")
+        temporary.write_text(obj_text(data.vertices, data.faces, data.name), encoding="utf-8")
+
+
+FORMAT = Format(read_mesh=_read, write_mesh=_write)

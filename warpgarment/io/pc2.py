@@ -13,6 +13,11 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 
+from .atomic import atomic_files
+from .data import Format, MotionData, ReadOptions
+from .obj import obj_text, read_obj
+from .ply import read_ply
+
 HEADER = struct.Struct("<12siiffi")
 SIGNATURE = b"POINTCACHE2\0"
 
@@ -54,3 +59,27 @@ def write_pc2_to(path: Path, vertices: np.ndarray, *, start: float = 0.0, sampli
         file.write(HEADER.pack(SIGNATURE, 1, count, start, sampling, frames))
         for frame in vertices:
             file.write(np.ascontiguousarray(frame, dtype="<f4").tobytes())
+
+
+def _read(path: Path, options: ReadOptions) -> MotionData:
+    """The cache, with the faces of the mesh of the same name beside it."""
+    readers = {path.with_suffix(".obj"): read_obj, path.with_suffix(".ply"): read_ply}
+    mesh = next((candidate for candidate in readers if candidate.exists()), None)
+    if mesh is None:
+        raise MeshError(
+            f"{path}: a point cache has no faces; put {path.stem}.obj, with the same vertex order, beside it."
+        )
+    vertices, (rest, faces) = read_pc2(path), readers[mesh](mesh)
+    if len(rest) != vertices.shape[1]:
+        raise MeshError(f"{path} has {vertices.shape[1]:,} points and {mesh.name} {len(rest):,} vertices.")
+    return MotionData(vertices, faces)
+
+
+def _write(path: Path, data: MotionData) -> None:
+    """The cache, and its first frame as .obj of the same name beside it."""
+    with atomic_files(path.with_suffix(".obj"), path) as (mesh, cache):
+        mesh.write_text(obj_text(data.vertices[0], data.faces, data.name), encoding="utf-8")
+        write_pc2_to(cache, data.vertices)
+
+
+FORMAT = Format(read_motion=_read, write_motion=_write)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias, cast
 
 import numpy as np
 
 from warpgarment.errors import MeshError
 
+from .atomic import atomic_file
+from .data import Format, MeshData, ReadOptions
 from .polygons import triangulate_counts
 
 TYPES = {
@@ -24,7 +25,8 @@ TYPES = {
 }
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 CORNERS = ("vertex_indices", "vertex_index")
-Column: TypeAlias = "np.ndarray | tuple[np.ndarray, np.ndarray]"  # numbers, or lists: their lengths, values end to end
+Table: TypeAlias = "dict[str, np.ndarray | tuple[np.ndarray, np.ndarray]]"  # numbers; lists: lengths, values end to end
+_NONE = np.zeros(0, dtype=np.int64)
 
 
 class _Element:
@@ -51,21 +53,46 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     data = path.read_bytes()
     try:
         order, elements, body = _header(data)
-        cursor = _Ascii(body) if order == "" else _Binary(body, order)
-        tables = {element.name: cursor.read(element) for element in elements}
-        table = tables["vertex"]
-        vertices = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        counts, indices = next(tables["face"][key] for key in CORNERS if key in tables["face"])
-    except (ValueError, KeyError, IndexError, StopIteration, UnicodeDecodeError) as error:
+        source = _Ascii(body) if order == "" else _Binary(body, order)
+        tables = {element.name: source.read(element) for element in elements}
+        vertices = np.stack([_numbers(tables["vertex"], axis) for axis in "xyz"], axis=1).astype(np.float64)
+        counts, indices = _corners(tables["face"], len(vertices))
+        faces = triangulate_counts(vertices, counts, indices)
+    except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
         raise MeshError(
             f"{path}: not a readable PLY mesh ({type(error).__name__}: {error}). "
             "It is damaged, cut short, or of another kind."
         ) from None
-    if len(vertices) == 0 or len(counts) == 0:
-        raise MeshError(f"{path}: {len(vertices):,} vertices and {len(counts):,} faces; this is not a mesh.")
-    if (counts < 3).any() or indices.min() < 0 or indices.max() >= len(vertices):
-        raise MeshError(f"{path}: faces with fewer than three corners, or beyond the {len(vertices):,} vertices.")
-    return vertices.astype(np.float32), triangulate_counts(vertices, counts, indices)
+    with np.errstate(over="ignore"):
+        return vertices.astype(np.float32), faces
+
+
+def _numbers(table: Table, name: str) -> np.ndarray:
+    column = table[name]
+    if isinstance(column, tuple):
+        raise ValueError(f"{name} is a list")
+    return column
+
+
+def _corners(table: Table, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of corners [P], and vertices of the corners end to end."""
+    name = next((key for key in CORNERS if key in table), None)
+    if name is None:
+        raise ValueError("the faces have no vertex_indices")
+    column = table[name]
+    if not isinstance(column, tuple):
+        raise ValueError(f"{name} is no list")
+    counts, indices = column
+    if vertex_count == 0 or len(counts) == 0:
+        raise ValueError(f"{vertex_count:,} vertices and {len(counts):,} faces; this is not a mesh")
+    if (counts < 3).any():
+        raise ValueError(f"face {int((counts < 3).argmax())} has {int(counts.min())} corners")
+    wrong = ~((indices >= 0) & (indices < vertex_count))  # NaN is neither
+    if wrong.any():
+        raise ValueError(f"a face names vertex {indices[wrong][0]:g}, and there are {vertex_count:,}")
+    if indices.dtype.kind == "f" and (indices != np.floor(indices)).any():
+        raise ValueError(f"a face names vertex {indices[indices != np.floor(indices)][0]:g}, which is a fraction")
+    return counts, indices.astype(np.int64)
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], bytes]:
@@ -80,7 +107,11 @@ def _header(data: bytes) -> tuple[str, list[_Element], bytes]:
             order = ORDERS[words[1]]
         elif words[0] == "element":
             elements.append(_Element(words[1], int(words[2])))
+            if elements[-1].count < 0:
+                raise ValueError(f"{words[2]} elements {words[1]}")
         elif words[0] == "property" and words[1] == "list":
+            if TYPES[words[2]][0] == "f":
+                raise ValueError(f"the lengths of {words[4]} are of type {words[2]}")
             elements[-1].properties.append((words[4], TYPES[words[3]], TYPES[words[2]]))
         elif words[0] == "property":
             elements[-1].properties.append((words[2], TYPES[words[1]], None))
@@ -89,79 +120,147 @@ def _header(data: bytes) -> tuple[str, list[_Element], bytes]:
     return order, elements, body
 
 
-class _Binary:
-    """Reads rows of fixed size at once, and rows with lists too as long as these have the first row's lengths."""
+class _Source:
+    """Elements one after another, in units of bytes or words; `at` is where the next begins.
 
-    def __init__(self, body: bytes, order: str):
-        self.body, self.order, self.at = body, order, 0
+    Each reader has the sizes of its types (`size_of`), a list's length at a place (`length_at`), values of rows that
+    are equally long (`block`) and values gathered from places (`gather`). Rows that are as long as the first are read
+    at once, others after one pass over their lengths alone.
+    """
 
-    def take(self, kind: str, count: int = 1) -> np.ndarray:
-        dtype = np.dtype(self.order + kind)
-        if self.at + dtype.itemsize * count > len(self.body):
-            raise ValueError(f"{len(self.body):,} bytes of data are too few")
-        values = np.frombuffer(self.body, dtype, count, self.at)
-        self.at += dtype.itemsize * count
-        return values
+    at = 0
+    end = 0
 
-    def read(self, element: _Element) -> dict:
-        return self._uniform(element) or _collect(element, self.take)
+    def size_of(self, kind: str) -> int:
+        raise NotImplementedError
 
-    def _uniform(self, element: _Element) -> dict[str, Column] | None:
-        start = self.at
-        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-        for name, kind, length in element.properties if element.count else ():
-            if length is None:
-                fields.append((name, self.order + kind))
-                self.take(kind)
-            else:
-                size = int(self.take(length)[0])
-                fields += [(f"{name}#", self.order + length), (name, self.order + kind, (size,))]
-                self.take(kind, size)
-        self.at = start
-        dtype = np.dtype(fields)
-        if not fields or start + dtype.itemsize * element.count > len(self.body):
+    def length_at(self, kind: str, at: int) -> int:
+        raise NotImplementedError
+
+    def block(self, kind: str, at: int, row: int, shape: tuple[int, int]) -> np.ndarray:
+        raise NotImplementedError
+
+    def gather(self, kind: str, places: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def read(self, element: _Element) -> Table:
+        """Columns of an element; the number of elements is believed only as far as the file has room for them."""
+        smallest = sum(self.size_of(length or kind) for _, kind, length in element.properties)
+        if smallest * element.count > self.end - self.at:
+            raise ValueError(f"{element.count:,} elements {element.name} do not fit into what is left of the file")
+        if not element.properties or not element.count:
+            return {name: (_NONE, _NONE) if length else _NONE for name, _, length in element.properties}
+        return self._alike(element) or self._each(element)
+
+    def _alike(self, element: _Element) -> Table | None:
+        """All rows at once, where each is as long as the first; otherwise None."""
+        places, row, sizes = [], 0, []
+        for _, kind, length in element.properties:
+            places.append(row)
+            sizes.append(self._length(length, self.at + row) if length else 1)
+            row += (self.size_of(length) if length else 0) + sizes[-1] * self.size_of(kind)
+        if row * element.count > self.end - self.at:
             return None
-        rows = np.frombuffer(self.body, dtype, element.count, start)
-        table: dict[str, Column] = {}
-        for name, _, length in element.properties:
-            table[name] = rows[name]
-            if length is not None:
-                if (rows[f"{name}#"] != rows[name].shape[1]).any():
-                    return None
-                table[name] = (rows[f"{name}#"].astype(np.int64), rows[name].reshape(-1))
-        self.at = start + dtype.itemsize * element.count
+        table: Table = {}
+        for (name, kind, length), place, size in zip(element.properties, places, sizes, strict=True):
+            at = self.at + place
+            if length is None:
+                table[name] = self.block(kind, at, row, (element.count, 1)).reshape(-1)
+                continue
+            if (self.block(length, at, row, (element.count, 1)) != size).any():
+                return None
+            values = self.block(kind, at + self.size_of(length), row, (element.count, size)).reshape(-1)
+            table[name] = (np.full(element.count, size, dtype=np.int64), values)
+        self.at += row * element.count
         return table
 
+    def _each(self, element: _Element) -> Table:
+        """Rows of different lengths: where each value lies, then all values of a property together."""
+        steps = [(self.size_of(kind), length, self.size_of(length) if length else 0)
+                 for _, kind, length in element.properties]  # fmt: skip
+        places: list[list[int]] = [[] for _ in steps]
+        lengths: list[list[int]] = [[] for _ in steps]
+        at = self.at
+        for _ in range(element.count):
+            for k, (size, length, own) in enumerate(steps):
+                count = self._length(length, at) if length else 1
+                places[k].append(at + own)
+                lengths[k].append(count)
+                at += own + count * size
+        if at > self.end:
+            raise ValueError("too few numbers")
+        self.at = at
+        table: Table = {}
+        for k, (name, kind, length) in enumerate(element.properties):
+            first, counts = np.array(places[k]), np.array(lengths[k])
+            within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            values = self.gather(kind, np.repeat(first, counts) + steps[k][0] * within)
+            table[name] = values if length is None else (counts, values)
+        return table
 
-class _Ascii:
-    """Reads numbers one after another: line breaks mean nothing more than spaces do."""
+    def _length(self, kind: str, at: int) -> int:
+        count = self.length_at(kind, at) if at + self.size_of(kind) <= self.end else -1
+        if not 0 <= count <= self.end - at:
+            raise ValueError("a list longer than what is left of the file")
+        return count
+
+
+class _Binary(_Source):
+    def __init__(self, body: bytes, order: str):
+        self.body, self.bytes, self.order, self.end = body, np.frombuffer(body, np.uint8), order, len(body)
+
+    def size_of(self, kind: str) -> int:
+        return int(kind[1])
+
+    def length_at(self, kind: str, at: int) -> int:
+        order: Literal["little", "big"] = "little" if self.order == "<" else "big"
+        return int.from_bytes(self.body[at : at + int(kind[1])], order, signed=kind[0] == "i")
+
+    def block(self, kind: str, at: int, row: int, shape: tuple[int, int]) -> np.ndarray:
+        return np.ndarray(shape, self.order + kind, self.body, at, (row, int(kind[1])))
+
+    def gather(self, kind: str, places: np.ndarray) -> np.ndarray:
+        size = int(kind[1])
+        if len(places) and places[-1] + size > self.end:
+            raise ValueError(f"{self.end:,} bytes of data are too few")
+        return self.bytes[places[:, None] + np.arange(size)].reshape(-1).view(self.order + kind)
+
+
+class _Ascii(_Source):
+    """Numbers one after another: line breaks mean nothing more than spaces do."""
 
     def __init__(self, body: bytes):
-        self.words, self.at = body.split(), 0
+        self.words = np.array(body.split(), dtype=np.float64)
+        self.end = len(self.words)
 
-    def take(self, kind: str, count: int = 1) -> np.ndarray:
-        words = self.words[self.at : self.at + count]
-        if len(words) < count:
+    def size_of(self, kind: str) -> int:
+        return 1
+
+    def length_at(self, kind: str, at: int) -> int:
+        count = self.words[at]
+        if count != np.floor(count) or not np.isfinite(count):  # NaN is not equal to itself
+            raise ValueError(f"a list of {count:g} numbers")
+        return int(count)
+
+    def block(self, kind: str, at: int, row: int, shape: tuple[int, int]) -> np.ndarray:
+        return np.ndarray(shape, self.words.dtype, self.words, 8 * at, (8 * row, 8))
+
+    def gather(self, kind: str, places: np.ndarray) -> np.ndarray:
+        if len(places) and places[-1] >= self.end:
             raise ValueError("too few numbers")
-        self.at += count
-        return np.array(words, dtype=np.float64).astype(np.dtype(kind))
-
-    def read(self, element: _Element) -> dict:
-        if element.properties and all(length is None for _, _, length in element.properties):
-            columns = self.take("f8", element.count * len(element.properties)).reshape(element.count, -1).T
-            return {name: column for (name, _, _), column in zip(element.properties, columns, strict=True)}
-        return _collect(element, self.take)
+        return self.words[places]
 
 
-def _collect(element: _Element, take: Callable[..., np.ndarray]) -> dict[str, Column]:
-    """Row by row; lists become (lengths, values end to end)."""
-    rows: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in element.properties}
-    for _ in range(element.count):
-        for name, kind, length in element.properties:
-            rows[name].append(take(kind, 1 if length is None else int(take(length)[0])))
-    table: dict[str, Column] = {}
-    for name, kind, length in element.properties:
-        values = np.concatenate([np.zeros(0, dtype=kind), *rows[name]])
-        sizes = np.array([len(row) for row in rows[name]], dtype=np.int64)
-        table[name] = values if length is None else (sizes, values)
-    return table
+def _read(path: Path, options: ReadOptions) -> MeshData:
+    return MeshData(*read_ply(path))
+
+
+def _write(path: Path, data: MeshData) -> None:
+    import trimesh
+
+    content = cast(bytes, trimesh.Trimesh(data.vertices, data.faces, process=False).export(file_type="ply"))
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(content)
+
+
+FORMAT = Format(read_mesh=_read, write_mesh=_write)

@@ -20,6 +20,8 @@ from warpgarment.geometry.checks import (
 )
 from warpgarment.geometry.orientation import turned_outward
 
+MOST_BETWEEN, LARGEST = 100, 1 << 30  # new frames for each old one, and bytes, that resampling makes at most
+
 
 class BodyMotion:
     """A deforming triangle mesh that a garment collides with.
@@ -105,10 +107,10 @@ class BodyMotion:
                 refuses them.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.sequence import read_sequence
+        from warpgarment.io.files import read_motion
 
         path = Path(path)
-        data = read_sequence(path, unit=unit, mesh=mesh)
+        data = read_motion(path, unit=unit, mesh=mesh)
         rate = fps if fps is not None else data.fps if data.fps is not None else 30.0
         try:
             motion = cls(data.vertices, data.faces, rate)
@@ -124,26 +126,33 @@ class BodyMotion:
         Args:
             path: File or folder to write; its suffix decides the format.
         """
-        from warpgarment.io.sequence import write_sequence
+        from warpgarment.io.data import MotionData
+        from warpgarment.io.files import write_motion
 
-        write_sequence(Path(path), self.vertices, self.faces, self.fps, name=Path(path).stem or "body")
+        write_motion(Path(path), MotionData(self.vertices, self.faces, self.fps, name=Path(path).stem or "body"))
 
-    def resampled(self, fps: float) -> BodyMotion:
+    def resampled(self, fps: float, frames: int | None = None) -> BodyMotion:
         """The motion at another rate, with positions interpolated linearly in time.
 
         It starts at the first frame and has as many whole frames as fit: floor((T - 1) fps' / fps) + 1.
 
         Args:
             fps: New frames per second.
+            frames: No more than so many of the new frames; None: all.
 
         Raises:
-            MeshError: The rate is not positive.
+            MeshError: The rate is not positive, or so much higher than the motion's that the frames would fill memory.
         """
         fps = checked_fps(fps)
         if fps == self.fps:
             return self
         last = self.frames - 1
-        count = int(np.floor(last * fps / self.fps + 1e-6)) + 1
+        count = int(min(np.floor(last * fps / self.fps + 1e-6) + 1, frames or np.inf, 2**62))
+        if count > MOST_BETWEEN * self.frames and 12 * count * self.vertices.shape[1] > LARGEST:
+            raise MeshError(
+                f"{self.frames:,} frames at {self.fps:g} a second would be {count:,} at {fps:g}: more than "
+                f"{LARGEST:,} bytes. Is the rate right? Give it with fps=."
+            )
         time = np.minimum(np.arange(count) * (self.fps / fps), last)
         before = np.minimum(time.astype(np.int64), max(last - 1, 0))
         share = (time - before).astype(np.float32)[:, None, None]

@@ -90,7 +90,7 @@ class Garment:
         Warns:
             UserWarning: The garment is larger than 10 m or smaller than 5 cm, so that the unit is probably wrong.
         """
-        from warpgarment.io.mesh import read_mesh
+        from warpgarment.io.files import read_mesh
 
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh)
@@ -108,9 +108,10 @@ class Garment:
         Args:
             path: File to write; its suffix decides the format.
         """
-        from warpgarment.io.mesh import write_mesh
+        from warpgarment.io.data import MeshData
+        from warpgarment.io.files import write_mesh
 
-        write_mesh(Path(path), self.vertices, self.faces, pins=self.pins, name=self.name)
+        write_mesh(Path(path), MeshData(self.vertices, self.faces, self.pins, self.name))
 
     @classmethod
     def cleaned_from(cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "") -> Garment:

@@ -70,11 +70,11 @@ class GarmentMotion:
             FileExistsError: The folder holds files that are not frames.
             MissingExtra: The format is USD and the extra is not installed (``pip install "warpgarment[usd]"``).
         """
-        from warpgarment.io.sequence import write_sequence
+        from warpgarment.io.data import MotionData
+        from warpgarment.io.files import write_motion
 
-        write_sequence(
-            Path(path), self.vertices, self.faces, self.fps, name=self.name or "garment", extra=self._status_arrays()
-        )
+        name, extra = self.name or "garment", self._status_arrays()
+        write_motion(Path(path), MotionData(self.vertices, self.faces, self.fps, name=name, extra=extra))
 
     @classmethod
     def load(
@@ -93,29 +93,22 @@ class GarmentMotion:
             MeshError: Not such a file.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.mesh import scale_of
-        from warpgarment.io.npz import read_npz
-        from warpgarment.io.sequence import read_sequence
+        from warpgarment.io.files import read_motion
 
         path = Path(path)
-        if path.suffix.lower() != ".npz":
-            found = read_sequence(path, unit=unit, mesh=mesh)
-            rate = fps if fps is not None else found.fps if found.fps is not None else 30.0
-            try:
-                return cls(found.vertices, found.faces, rate, name=path.stem)
-            except MeshError as error:
-                raise MeshError(f"{path}: {error}") from None
-        scale, data = scale_of(unit), read_npz(path, required=("vertices", "faces", "fps"))
+        data = read_motion(path, unit=unit, mesh=mesh)
+        if path.suffix.lower() == ".npz" and data.fps is None and fps is None:
+            raise MeshError(f"{path}: no array named 'fps'; it is not what GarmentMotion.save writes. Give fps=.")
+        rate = fps if fps is not None else data.fps if data.fps is not None else 30.0
         try:
             status: list[RolloutStatus] = []
-            if "status_finite" in data:
-                verdicts = [Verdict(str(v)) for v in data["status_verdict"]]
-                columns = [data[f"status_{key}"].tolist() for key in _STATUS]
+            if "status_finite" in data.extra:
+                verdicts = [Verdict(str(v)) for v in data.extra["status_verdict"]]
+                columns = [data.extra[f"status_{key}"].tolist() for key in _STATUS]
                 rows = zip(*columns, verdicts, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
-            name = str(data["name"]) if "name" in data else path.stem
-            vertices = data["vertices"] if scale == 1.0 else np.asarray(data["vertices"], np.float64) * scale
-            return cls(vertices, data["faces"], float(data["fps"]) if fps is None else fps, status, name)
+            name = str(data.extra["name"]) if "name" in data.extra else path.stem
+            return cls(data.vertices, data.faces, rate, status, name)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
 

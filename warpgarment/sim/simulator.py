@@ -165,9 +165,9 @@ class Simulator:
         bodies = per_garment(body, BodyMotion, len(garments), "bodies")
         unique = list({id(b): b for b in bodies}.values())
         number = {id(b): i for i, b in enumerate(unique)}
-        motions = [b.resampled(self.network.config.fps) for b in unique]
         if frames is not None and frames < 1:
             raise ValueError(f"frames must be at least 1, got {frames}")
+        motions = [b.resampled(self.network.config.fps, frames) for b in unique]
         known = self._known(garments, single, first_vertices, history)
         given = known.shape[0]
         lengths = [min(motions[number[id(b)]].frames, frames or 2**62) for b in bodies]

@@ -24,7 +24,7 @@ from warpgarment.training.teachers import ClothScene, TeacherError
 from warpgarment.training.teachers.scenes import check_scenes, used_body
 
 from .environment import find_environment, version_of
-from .units import BlenderSettings, blender_numbers, pin_path, to_y_up, to_z_up
+from .units import LAYERED, BlenderSettings, blender_numbers, pin_path, to_y_up, to_z_up
 
 SCRIPT = Path(__file__).with_name("script.py")
 MAGIC = b"warpgarment-frames 1\n"
@@ -143,3 +143,8 @@ def _failed(child: subprocess.Popen, errors: IO[bytes], what: str) -> TeacherErr
     said = errors.read().decode(errors="replace").strip()[-LAST_WORDS:]
     status = "is still running" if child.returncode is None else f"left with status {child.returncode}"
     return TeacherError(f"Blender {what} and {status}. Its last words:\n{said or '(none)'}")
+
+
+def make(device: str | None) -> BlenderTeacher:
+    """The teacher as `generate` uses it; see `teachers.make_teacher`. Blender's cloth runs on the CPU in any case."""
+    return BlenderTeacher(LAYERED)

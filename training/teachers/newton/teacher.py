@@ -37,6 +37,8 @@ from warpgarment.training.teachers.scenes import check_scenes
 from .settings import NewtonSettings, layer_friction
 from .worlds import Worlds
 
+LAYER_FRICTION = 0.2  # between cloths: Newton has one coefficient for all worlds it simulates at once
+
 
 class NewtonTeacher:
     """Simulates cloth with Newton's VBD solver (extra `physics`).
@@ -171,3 +173,8 @@ class NewtonTeacher:
                     vertices_of_worlds[w] = np.full_like(vertices, np.nan)
             if frame >= settle:
                 yield vertices_of_worlds
+
+
+def make(device: str | None) -> NewtonTeacher:
+    """The teacher as `generate` uses it; see `teachers.make_teacher`."""
+    return NewtonTeacher(NewtonSettings(layer_friction=LAYER_FRICTION), device=device)

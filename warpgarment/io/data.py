@@ -1,0 +1,100 @@
+"""What files hold, and what a file format is: the contract between `io.files` and the module of each format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+
+
+class MeshData(NamedTuple):
+    """What a file of a mesh holds, unchecked beyond the format.
+
+    Attributes:
+        vertices: Positions, shape [V,3].
+        faces: Vertex indices, counter-clockwise seen from outside, shape [F,3].
+        pins: Vertex indices, shape [P], in formats that keep them.
+        name: Of the mesh inside the file; empty where it has none.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    pins: np.ndarray | None = None
+    name: str = ""
+
+
+class MotionData(NamedTuple):
+    """What a file of a moving mesh holds, unchecked beyond the format.
+
+    Attributes:
+        vertices: Positions, shape [T,V,3].
+        faces: Vertex indices, counter-clockwise seen from outside, shape [F,3].
+        fps: Frames per second; None where the file does not say.
+        collider_faces: Faces that take part in collisions, bool [F]; None: all.
+        name: Of the mesh inside the file; empty where it has none.
+        extra: Further arrays by name, in formats that keep them.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    fps: float | None = None
+    collider_faces: np.ndarray | None = None
+    name: str = ""
+    extra: Mapping[str, np.ndarray] = {}
+
+
+class ReadOptions(NamedTuple):
+    """What the user says about a file.
+
+    Attributes:
+        mesh: Name of the mesh to read, where the file holds several; None: the only one.
+        unit: Length unit of the file, a key of `UNITS`; None: the one that the file names, otherwise metres.
+    """
+
+    mesh: str | None = None
+    unit: str | None = None
+
+
+class Format(NamedTuple):
+    """A file format: four functions, each None where the format has no such thing.
+
+    The functions that read get a path that exists. They return positions with Y up, in metres where the file names its
+    unit and `ReadOptions.unit` is None, otherwise in the numbers of the file, which `io.files` then scales. They raise
+    MeshError, beginning with the path, for a file that is damaged, cut short or of another kind; the arrays are checked
+    (indices in range, finite positions) by the objects made of them. A mesh is also a motion of one frame: a format
+    whose motions are nothing more leaves `read_motion` out.
+
+    The functions that write get metres, and make the file appear completely or not at all (see `io.atomic`).
+
+    Attributes:
+        extra: The extra of this package that brings what the format needs; None: nothing more is needed.
+        read_mesh: Reads a mesh at rest.
+        write_mesh: Writes one.
+        read_motion: Reads a mesh in motion.
+        write_motion: Writes one.
+        only_read: Suffixes of the format that are read and never written.
+    """
+
+    extra: str | None = None
+    read_mesh: Callable[[Path, ReadOptions], MeshData] | None = None
+    write_mesh: Callable[[Path, MeshData], None] | None = None
+    read_motion: Callable[[Path, ReadOptions], MotionData] | None = None
+    write_motion: Callable[[Path, MotionData], None] | None = None
+    only_read: tuple[str, ...] = ()
+
+
+def scale_of(unit: str | None) -> float:
+    """Metres in a unit; 1 for None.
+
+    Raises:
+        ValueError: An unknown unit.
+    """
+    if unit is None:
+        return 1.0
+    if unit not in UNITS:
+        raise ValueError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
+    return UNITS[unit]

@@ -1,0 +1,166 @@
+"""Reads and writes meshes and motions by suffix: `FORMATS` names the module of each format, loaded when it is used."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from warpgarment.errors import MeshError
+
+from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
+
+# Suffixes -> the module whose FORMAT reads and writes them; "" is a folder. docs/extending_files.md adds one.
+FORMATS: dict[tuple[str, ...], str] = {
+    (".obj",): "warpgarment.io.obj",
+    (".ply",): "warpgarment.io.ply",
+    (".npz",): "warpgarment.io.npz",
+    (".stl", ".glb", ".gltf"): "warpgarment.io.joined",
+    (".usd", ".usda", ".usdc", ".usdz"): "warpgarment.io.usd",
+    (".pc2",): "warpgarment.io.pc2",
+    ("",): "warpgarment.io.folder",
+}
+BIGGEST, SMALLEST = 10.0, 0.05  # sizes [m] beyond which a garment's unit is probably another
+
+Ability = Literal["read_mesh", "write_mesh", "read_motion", "write_motion"]
+
+
+def format_of(suffix: str) -> Format | None:
+    """The format of a lower-case suffix, "" being a folder; None where there is none."""
+    module = next((module for suffixes, module in FORMATS.items() if suffix in suffixes), None)
+    return None if module is None else importlib.import_module(module).FORMAT
+
+
+def suffixes(ability: Ability) -> list[str]:
+    """Suffixes of the formats that can do something, in the order of `FORMATS`; a mesh is read as a motion too."""
+    found = []
+    for every in FORMATS:
+        format = format_of(every[0])
+        assert format is not None
+        able = getattr(format, ability) or (ability == "read_motion" and format.read_mesh)
+        if able:
+            found += [s for s in every if ability.startswith("read") or s not in format.only_read]
+    return found
+
+
+def listed(names: Sequence[str]) -> str:
+    """Suffixes as a list in words: ".obj, .ply or a folder without a suffix"."""
+    words = [name or "a folder without a suffix" for name in names]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+
+def read_mesh(path: Path, *, unit: str | None = None, mesh: str | None = None, expect_garment: bool = True) -> MeshData:
+    """Reads a mesh as `Garment.load` describes; the arrays are not checked beyond the format.
+
+    Args:
+        path: The file.
+        unit: See `Garment.load`.
+        mesh: See `Garment.load`.
+        expect_garment: Warn about sizes that no garment has.
+
+    Raises:
+        MeshError: Not a file of its kind, cut short, or a suffix that is not known.
+        FileNotFoundError: There is no such file.
+    """
+    path, scale = Path(path), scale_of(unit)
+    format = _reader(path, "read_mesh")
+    assert format.read_mesh is not None
+    data = format.read_mesh(path, ReadOptions(mesh, unit))
+    if scale != 1.0:
+        data = data._replace(vertices=np.asarray(data.vertices, dtype=np.float64) * scale)
+    if expect_garment:
+        _warn_about_size(path, np.asarray(data.vertices), scale)
+    return data
+
+
+def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None) -> MotionData:
+    """Reads a moving mesh as `BodyMotion.load` describes; the arrays are not checked beyond the format.
+
+    Args:
+        path: File or folder.
+        unit: See `BodyMotion.load`.
+        mesh: See `BodyMotion.load`.
+
+    Raises:
+        MeshError: Not a file of its kind, cut short, arrays that do not fit each other, or a suffix that is not known.
+        FileNotFoundError: There is no such file.
+    """
+    path, scale = Path(path), scale_of(unit)
+    format, options = _reader(path, "read_motion"), ReadOptions(mesh, unit)
+    if format.read_motion is not None:
+        data = format.read_motion(path, options)
+    else:
+        assert format.read_mesh is not None
+        single = format.read_mesh(path, options)
+        data = MotionData(np.asarray(single.vertices)[None], single.faces, name=single.name)
+    return data if scale == 1.0 else data._replace(vertices=np.asarray(data.vertices, dtype=np.float64) * scale)
+
+
+def write_mesh(path: Path, data: MeshData) -> None:
+    """Writes a mesh by suffix, completely or not at all.
+
+    Args:
+        path: The file; parent folders are made.
+        data: Positions in metres; pins are kept by .npz only.
+
+    Raises:
+        ValueError: A suffix that is not written.
+    """
+    format = _writer(Path(path), "write_mesh")
+    assert format.write_mesh is not None
+    format.write_mesh(Path(path), data)
+
+
+def write_motion(path: Path, data: MotionData) -> None:
+    """Writes a moving mesh by suffix, as `GarmentMotion.save` describes, completely or not at all.
+
+    Args:
+        path: The file, or a folder without a suffix; parent folders are made.
+        data: Positions in metres, with a rate; `extra` is kept by .npz only.
+
+    Raises:
+        ValueError: A suffix that is not written.
+    """
+    format = _writer(Path(path), "write_motion")
+    assert format.write_motion is not None
+    format.write_motion(Path(path), data)
+
+
+def _reader(path: Path, ability: Literal["read_mesh", "read_motion"]) -> Format:
+    if not path.exists():
+        raise FileNotFoundError(f"No such file: {path}")
+    suffix, able = "" if path.is_dir() else path.suffix.lower(), suffixes(ability)
+    if suffix in able and (suffix or path.is_dir()):
+        format = format_of(suffix)
+        assert format is not None
+        return format
+    kind = "a folder" if path.is_dir() else suffix or "files without a suffix"
+    raise MeshError(f"{path}: cannot read {kind}{' as a mesh' if ability == 'read_mesh' else ''}; use {listed(able)}.")
+
+
+def _writer(path: Path, ability: Literal["write_mesh", "write_motion"]) -> Format:
+    suffix, able = path.suffix.lower(), suffixes(ability)
+    format = format_of(suffix)
+    if suffix not in able or format is None:
+        raise ValueError(f"cannot write {suffix or 'a file without a suffix'}; use {listed(able)}")
+    return format
+
+
+def _warn_about_size(path: Path, vertices: np.ndarray, scale: float) -> None:
+    if vertices.ndim != 2 or not len(vertices) or vertices.dtype.kind != "f" or not np.isfinite(vertices).all():
+        return
+    size = float(np.ptp(vertices, axis=0).max())
+    if SMALLEST <= size <= BIGGEST or size == 0:
+        return
+    fits = [f'unit="{name}" ({size / scale * metres:.2g} m)' for name, metres in UNITS.items()
+            if 0.2 <= size / scale * metres <= 2.5]  # fmt: skip
+    advice = (
+        f"Is it in another unit? Try {' or '.join(fits)}."
+        if fits
+        else "Check the scale it was exported with, and unit=."
+    )
+    warnings.warn(f"{path}: the garment would be {size:.3g} m in size. {advice}", UserWarning, stacklevel=4)

@@ -1,0 +1,33 @@
+"""USD: one mesh of a stage, moved by its points, its transforms or its skeleton; ``pip install "warpgarment[usd]"``."""
+
+from pathlib import Path
+
+import numpy as np
+
+from warpgarment.io.data import Format, MeshData, MotionData, ReadOptions
+
+from .reading import UsdMesh, read_usd
+from .writing import write_usd
+
+__all__ = ["FORMAT", "UsdMesh", "read_usd", "write_usd"]
+
+
+def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
+    found = read_usd(path, mesh=options.mesh, frames=False, convert=options.unit is None)
+    return MeshData(found.vertices[0], found.faces)
+
+
+def _write_mesh(path: Path, data: MeshData) -> None:
+    write_usd(path, [(data.name or "garment", np.asarray(data.vertices)[None], data.faces)], 30.0)
+
+
+def _read_motion(path: Path, options: ReadOptions) -> MotionData:
+    found = read_usd(path, mesh=options.mesh, convert=options.unit is None)
+    return MotionData(found.vertices, found.faces, found.fps, name=found.name)
+
+
+def _write_motion(path: Path, data: MotionData) -> None:
+    write_usd(path, [(data.name or "mesh", data.vertices, data.faces)], 30.0 if data.fps is None else data.fps)
+
+
+FORMAT = Format("usd", _read_mesh, _write_mesh, _read_motion, _write_motion, only_read=(".usdz",))

@@ -1,0 +1,91 @@
+"""Writes meshes with time-sampled points as a USD stage."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgarment.errors import MeshError, MissingExtra
+from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
+from warpgarment.io.atomic import atomic_file
+
+SUFFIXES = (".usd", ".usda", ".usdc")
+
+
+def pxr() -> tuple[Any, ...]:
+    """USD's modules Gf, Sdf, Usd, UsdGeom and Vt.
+
+    Raises:
+        MissingExtra: usd-core is not installed.
+    """
+    try:
+        from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+    except ImportError:
+        raise MissingExtra("usd", "Reading and writing USD") from None
+    return Gf, Sdf, Usd, UsdGeom, Vt
+
+
+def write_usd(path: Path, meshes: Sequence[tuple[str, np.ndarray, np.ndarray]], fps: float) -> None:
+    """Writes meshes as one stage, completely or not at all.
+
+    Y up, metresPerUnit 1, one time code a frame from 0, no subdivision, extents for every frame.
+
+    Args:
+        path: .usd, .usda or .usdc.
+        meshes: Name, vertices [T,V,3] in metres and faces [F,3] of each, such as garment and body; the same T for all.
+        fps: Time codes (frames) per second.
+
+    Raises:
+        MeshError: Other shapes, indices out of range, or different numbers of frames.
+        MissingExtra: usd-core is not installed.
+    """
+    Gf, _, Usd, UsdGeom, Vt = pxr()
+    path, fps = Path(path), checked_fps(fps)
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"USD is written as .usd, .usda or .usdc, not {path.suffix!r}")
+    if not meshes:
+        raise MeshError("No mesh to write.")
+    checked = []
+    for name, vertices, faces in meshes:
+        vertices = checked_positions(vertices, name=f"vertices of {name!r}", frames=True, finite=False)
+        checked.append((name, vertices, checked_faces(faces, vertices.shape[1], name=f"faces of {name!r}")))
+    frames = {len(vertices) for _, vertices, _ in checked}
+    if len(frames) > 1:
+        raise MeshError(f"The meshes have {' and '.join(map(str, sorted(frames)))} frames. Give them the same number.")
+    with atomic_file(path) as temporary:
+        stage = Usd.Stage.CreateNew(str(temporary))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(len(checked[0][1]) - 1)
+        root = UsdGeom.Xform.Define(stage, "/root")
+        stage.SetDefaultPrim(root.GetPrim())
+        taken: set[str] = set()
+        for name, vertices, faces in checked:
+            mesh = UsdGeom.Mesh.Define(stage, f"/root/{_identifier(name, taken)}")
+            mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+            mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, dtype=np.int32)))
+            mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1)))
+            points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
+            for frame, positions in enumerate(vertices):
+                points.Set(Vt.Vec3fArray.FromNumpy(positions), frame)
+                low, high = positions.min(axis=0), positions.max(axis=0)
+                extent.Set(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]), frame)
+        stage.GetRootLayer().Save()
+        del stage
+
+
+def _identifier(name: str, taken: set[str]) -> str:
+    base = re.sub(r"[^A-Za-z0-9_]", "_", name) or "mesh"
+    base = f"_{base}" if base[0].isdigit() else base
+    unique, n = base, 1
+    while unique in taken:
+        unique, n = f"{base}_{n}", n + 1
+    taken.add(unique)
+    return unique
