@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
-from warpgarment.kernels.features.face import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.features.channels import FACE, FEATURES, INTERACTION
+from warpgarment.kernels.features.face import face_features
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
@@ -24,12 +25,10 @@ from warpgarment.sim.scene import Scene
 from warpgarment.sim.timing import Timings
 
 from .augmentation import Augmentation
-from .interactions import COLUMNS, unpack
+from .interactions import unpack
 from .noise import NoiseConfig
 from .recorded import SequenceData
 from .single_step import HistoryBuilder
-
-_VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
 
 
 @dataclass(frozen=True)
@@ -73,13 +72,8 @@ def turned(
         turn: G, [R,3,3].
         joint: J, [R,3,3].
     """
-    both = torch.eye(FEATURES).to(turn).repeat(len(turn), 1, 1)
-    for name, right in (("deformation_gradient", joint), ("body_deformation", turn)):
-        both[:, LAYOUT[name], LAYOUT[name]] = torch.einsum("bij,bkl->bikjl", turn, right).reshape(-1, 9, 9)
-    for name in _VECTORS:
-        both[:, LAYOUT[name], LAYOUT[name]] = turn
     rows = features.unflatten(-1, (-1, FEATURES))
-    seen = (rows.flatten(1, 2) @ both.mT).reshape(features.shape)
+    seen = (rows.flatten(1, 2) @ FACE.turn(turn, joint).mT).reshape(features.shape)
     return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
 
 
@@ -138,8 +132,7 @@ class UnrolledBuilder(HistoryBuilder):
             if delta is not None:  # frames before the first repeat it, displaced as it is
                 moved = moved + torch.from_numpy(delta[np.maximum(np.arange(history), early)]).to(device)
             seen = data.interaction[frames].clone()  # [H,F,16]
-            seen[:early, :, COLUMNS["deformation"]] = torch.eye(3, device=device).flatten()
-            seen[:early, :, COLUMNS["velocity"]] = 0.0
+            seen[:early] = INTERACTION.still(seen[:early])
             past.append(moved)
             rows.append(seen)
             bodies.append(data.body_frames([int(frames[0]), *range(t, t + self.steps + 1)]))

@@ -9,7 +9,8 @@ import torch
 
 from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
 from warpgarment.kernels.deformation.svd import replace_singular_values
-from warpgarment.kernels.features.face import LAYOUT, body_interaction, face_features
+from warpgarment.kernels.features.channels import LAYOUT
+from warpgarment.kernels.features.face import body_interaction, face_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn.parametrisation import Step
 from warpgarment.objects.pack import PackedGarments
