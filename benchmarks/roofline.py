@@ -26,7 +26,7 @@ from benchmarks.batch import scenes_of
 from benchmarks.measure import NO_GPU, Row, figures, interleaved
 from benchmarks.networks import Named
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
-from warpgarment.kernels.features.face import FEATURES
+from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import forward_flops
 from warpgarment.nn.patches.layout import SHARES, PatchLayout

@@ -17,7 +17,7 @@ import warp as wp
 from warpgarment.kernels.launch import as_argument, expect, torch_stream
 from warpgarment.kernels.operator import allocate
 
-from .face import FEATURES, LAYOUT
+from .channels import FEATURES, LAYOUT
 
 LIFT = wp.constant(0.005)
 """l [m], more than the depth at which refinement leaves all but a few vertices."""

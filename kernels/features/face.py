@@ -33,19 +33,9 @@ from warpgarment.kernels.operator import allocate, row_operator
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.closest import MAX_DISTANCE, Bodies, closest_on_body
 
-LAYOUT: dict[str, slice] = {
-    "deformation_gradient": slice(0, 9),
-    "normal": slice(9, 12),
-    "centroid": slice(12, 15),
-    "signed_distance": slice(15, 16),
-    "direction_to_body": slice(16, 19),
-    "body_deformation": slice(19, 28),
-    "body_velocity": slice(28, 31),
-    "singular_values": slice(31, 34),
-}
-"""Where each feature lies among the `FEATURES` numbers of a face."""
+from .channels import FEATURES, LAYOUT
 
-FEATURES = 34
+AT = {name: place.start for name, place in LAYOUT.items()}
 
 TOUCHING = wp.constant(1.0e-9)  # metres; closer than this, a point has no direction to the body
 # Height over longest edge; the motion of thinner body faces is mostly rounding
@@ -132,6 +122,34 @@ def body_interaction_kernel(
 
 
 @wp.func
+def face_and_mean(
+    i: int,
+    faces: wp.array[wp.vec3i],
+    garment_of_face: wp.array[wp.int32],
+    vertices: wp.array[wp.vec3],
+    garment_mean: wp.array[wp.vec3],
+    features: wp.array2d[wp.float32],
+):
+    """Corners of face i and its garment's mean, and whether there are such: where not, its features are NaN."""
+    face = faces[i]
+    garment = garment_of_face[i]
+    exist = corners_exist(face, vertices.shape[0]) and garment >= 0 and garment < garment_mean.shape[0]
+    a = wp.vec3(0.0)
+    b = wp.vec3(0.0)
+    c = wp.vec3(0.0)
+    mean = wp.vec3(0.0)
+    if exist:
+        a = vertices[face[0]]
+        b = vertices[face[1]]
+        c = vertices[face[2]]
+        mean = garment_mean[garment]
+    else:
+        for k in range(wp.static(FEATURES)):
+            features[i, k] = wp.nan
+    return exist, a, b, c, mean
+
+
+@wp.func
 def write_features(
     features: wp.array2d[wp.float32],
     i: int,
@@ -159,14 +177,15 @@ def write_features(
 
     for row in range(3):
         for column in range(3):
-            features[i, 3 * row + column] = phi[row, column]
-            features[i, 19 + 3 * row + column] = body_deformation[row, column]
-        features[i, 9 + row] = q[row, 2]
-        features[i, 12 + row] = z[row] - mean[row]
-        features[i, 16 + row] = direction[row]
-        features[i, 28 + row] = body_velocity[row]
-        features[i, 31 + row] = s[row]
-    features[i, 15] = sign * distance
+            k = 3 * row + column
+            features[i, wp.static(AT["deformation_gradient"]) + k] = phi[row, column]
+            features[i, wp.static(AT["body_deformation"]) + k] = body_deformation[row, column]
+        features[i, wp.static(AT["normal"]) + row] = q[row, 2]
+        features[i, wp.static(AT["centroid"]) + row] = z[row] - mean[row]
+        features[i, wp.static(AT["direction_to_body"]) + row] = direction[row]
+        features[i, wp.static(AT["body_velocity"]) + row] = body_velocity[row]
+        features[i, wp.static(AT["singular_values"]) + row] = s[row]
+    features[i, wp.static(AT["signed_distance"])] = sign * distance
 
 
 @wp.kernel
@@ -185,14 +204,9 @@ def face_features_kernel(
     features: wp.array2d[wp.float32],
 ):
     i = wp.tid()
-    face = faces[i]
-    garment = garment_of_face[i]
-    if not corners_exist(face, vertices.shape[0]) or garment < 0 or garment >= garment_mean.shape[0]:
-        for k in range(wp.static(FEATURES)):
-            features[i, k] = wp.nan
+    exist, a, b, c, mean = face_and_mean(i, faces, garment_of_face, vertices, garment_mean, features)
+    if not exist:
         return
-    a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
-    mean = garment_mean[garment]
     write_features(
         features, i, a, b, c, inverse_rest[i], mean, closest[i], sign[i], body_deformation[i], body_velocity[i]
     )
@@ -289,7 +303,7 @@ def face_features(
         interaction: From `body_interaction`.
 
     Returns:
-        float32 [F, 34]; columns as in `LAYOUT`. Differentiable in vertices and garment_mean.
+        float32 [F, 34]; columns as in `LAYOUT` (channels.py). Differentiable in vertices and garment_mean.
     """
     expect_mesh(vertices, faces)
     rows, device = faces.shape[0], vertices.device
@@ -329,17 +343,12 @@ def frame_features_kernel(
     features: wp.array2d[wp.float32],
 ):
     i = wp.tid()
-    face = faces[i]
-    garment = garment_of_face[i]
-    if not corners_exist(face, vertices.shape[0]) or garment < 0 or garment >= garment_mean.shape[0]:
-        for k in range(wp.static(FEATURES)):
-            features[i, k] = wp.nan
+    exist, a, b, c, mean = face_and_mean(i, faces, garment_of_face, vertices, garment_mean, features)
+    if not exist:
         return
-    a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
     closest, sign, _face, deformation, velocity = nearest_motion(
         bodies, body_of_face[i], (a + b + c) / 3.0, next_vertices
     )
-    mean = garment_mean[garment]
     write_features(features, i, a, b, c, inverse_rest[i], mean, closest, sign, deformation, velocity)
 
 
@@ -360,7 +369,7 @@ def frame_features(
         body_of_face, bodies, next_vertices: As in `body_interaction`.
 
     Returns:
-        float32 [F, 34]; columns as in `LAYOUT`.
+        float32 [F, 34]; columns as in `LAYOUT` (channels.py).
     """
     expect_mesh(vertices, faces)
     rows, device = faces.shape[0], bodies.device

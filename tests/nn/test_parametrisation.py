@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.spatial.transform
 import torch
 
-from warpgarment.kernels.features.face import FEATURES, LAYOUT
+from warpgarment.kernels.features.channels import FEATURES, LAYOUT
 from warpgarment.nn.parametrisation import NetworkOutput, Step, component_mean, compose, context, targets
 
 COMPONENT = torch.tensor([[0, 0, 1, 1, 1, 0], [0, 1, 2, 2, 0, 1]])

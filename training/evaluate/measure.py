@@ -214,7 +214,7 @@ def draw(path: Path, curves: dict[tuple[str, str], list[np.ndarray]]) -> None:
 
 def _describe(path: Path, simulator: Simulator) -> dict[str, Any]:
     _, notes = checkpoint.read_metadata(path)
-    return {"file": path.name, "config": vars(simulator.network.config), "notes": notes}
+    return {"file": path.name, "config": simulator.network.config.as_dict(), "notes": notes}
 
 
 def _pyplot() -> Any:

@@ -10,7 +10,6 @@ The page, `card.md` with `card/*.png`, describes the network, the data, the trai
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -83,7 +82,7 @@ def write_card(config: ModelCardConfig) -> Path:
     path = checkpoint.find(config.network, device=config.device)
     network = checkpoint.load(path)
     _, notes = checkpoint.read_metadata(path)
-    evaluation = read_evaluation(config.evaluation, vars(network.config), notes)
+    evaluation = read_evaluation(config.evaluation, network.config.as_dict(), notes)
     log = config.log or (path if path.is_dir() else path.parent) / "log.jsonl"
     if config.log is not None and not log.is_file():
         raise CardError(f"{log}: no such file; leave log away for a page without curves")
@@ -115,7 +114,7 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CardError(f"{path}: no result of an evaluation ({type(error).__name__}: {error})") from error
     # A setting that was introduced later has its default value in older files.
-    settings = {f.name: f.default for f in dataclasses.fields(NetworkConfig)} | dict(about.get("config") or {})
+    settings = NetworkConfig().as_dict() | dict(about.get("config") or {})
     if settings != dict(config) or about.get("notes") != dict(notes):
         raise CardError(
             f"{path}: is of another network ({about.get('file')}; its settings or notes differ). Evaluate this one."

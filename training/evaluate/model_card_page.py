@@ -52,7 +52,7 @@ def page(
                 "",
                 f"{network.parameter_count():,} parameters.",
                 "",
-                *table(["setting", "value"], vars(network.config).items()),
+                *table(["setting", "value"], network.config.as_dict().items()),
                 "## Data",
                 "",
                 *_data(notes, facts),

@@ -17,14 +17,15 @@ percentile from 9 % to 44 %. New triangulations come from the teacher: every gen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 
-from warpgarment.kernels.features.face import FEATURES, LAYOUT
+from warpgarment.kernels.features.channels import FACE, Channel, Kind, Layout
 from warpgarment.nn.parametrisation import NetworkOutput
 
 LARGEST_SCALE = 0.1
+VELOCITY = Layout([Channel("velocity", 3, Kind.VECTOR)])
+PSI = Layout([Channel("psi", 9, Kind.MAP)])
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def mirror(
         target: [B,N,3,3], [B,N,3], [B,C,3].
         chosen: Which samples, bool [B].
     """
-    vector, matrix, face = _signs(features.device)
+    vector, matrix, face = (layout.mirror(features.device) for layout in (VELOCITY, PSI, FACE))
 
     def signs(values: torch.Tensor, width: int) -> torch.Tensor:
         values = values.repeat(width // len(values))
@@ -79,16 +80,3 @@ def mirror(
             psi=(psi * signs(matrix, 9)).unflatten(-1, (3, 3)), velocity=target.velocity * signs(vector, 3)
         ),
     )
-
-
-@lru_cache
-def _signs(device: torch.device) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Signs of a vector [3], a matrix [9] and a face's features [34]; kept, since a copy to a GPU would wait for it."""
-    vector = torch.tensor([-1.0, 1.0, 1.0])
-    matrix = torch.outer(vector, vector).flatten()
-    face = torch.ones(FEATURES)
-    for name in ("deformation_gradient", "body_deformation"):
-        face[LAYOUT[name]] = matrix
-    for name in ("normal", "centroid", "direction_to_body", "body_velocity"):
-        face[LAYOUT[name]] = vector
-    return vector.to(device), matrix.to(device), face.to(device)

@@ -11,7 +11,6 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 import torch
 
-from .interactions import COLUMNS
 from .noise import NoiseConfig
 from .recorded import SequenceData
 
@@ -105,9 +104,3 @@ class Past(NamedTuple):
     def held(self, delta: np.ndarray) -> np.ndarray:
         """A displacement [H,V,3] with early frames displaced as the first one is."""
         return delta[np.maximum(np.arange(len(self.frames)), self.early)]
-
-
-def rest(rows: torch.Tensor) -> None:
-    """Writes a body at rest into interactions [...,16]: it is neither deformed nor moving."""
-    rows[..., COLUMNS["deformation"]] = torch.eye(3, device=rows.device).flatten()
-    rows[..., COLUMNS["velocity"]] = 0.0

@@ -5,7 +5,7 @@ Closest points and signs depend on the recorded garment, not on the network, and
 far the dearest part of a training sample, are done once for every frame t in 0..T-2 and stored as one memory-mapped
 array
 
-    interaction.npy   float32 [T-1, F, 16]   columns: see COLUMNS; row t holds the body's motion from frame t to t + 1
+    interaction.npy   float32 [T-1, F, 16]   columns: see channels.py; row t: the body's motion from t to t + 1
     geodesics.npy     float32 [F, F]         metres, inf across components; garments beyond 10,000 faces have none
 
 in a folder named after the sequence and the checksum of everything that went in (array files, versions). A folder is
@@ -30,19 +30,13 @@ import torch
 import warpgarment
 from warpgarment.io.atomic import atomic_folder
 from warpgarment.kernels.deformation.gradients import face_centroids
+from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.training.rollouts import RecordedOnBody
 
 CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
 MANIFEST = "manifest.json"
-WIDTH = 16
-COLUMNS: dict[str, int | slice] = {
-    "closest": slice(0, 3),
-    "sign": 3,
-    "deformation": slice(4, 13),
-    "velocity": slice(13, 16),
-}
 _SOURCES = (
     "garment_rest_vertices", "garment_faces", "garment_vertices", "body_rest_vertices", "body_faces", "collider_faces",
     "bone_indices", "bone_weights", "bone_transforms",
@@ -86,7 +80,7 @@ def compute(sequence: RecordedOnBody, device: torch.device | str = "cpu") -> np.
         device: Where the queries run.
 
     Returns:
-        float32 [T-1, F, 16], columns as in COLUMNS.
+        float32 [T-1, F, 16], columns as in `INTERACTION`.
     """
     device = torch.device(device)
     faces = torch.as_tensor(np.ascontiguousarray(sequence.garment.faces), dtype=torch.int32, device=device)
@@ -94,7 +88,7 @@ def compute(sequence: RecordedOnBody, device: torch.device | str = "cpu") -> np.
     body_vertices = torch.as_tensor(np.asarray(body.vertices, np.float32), device=device)
     body_faces = torch.as_tensor(np.asarray(body.faces, np.int32), device=device)
     frames = min(len(sequence.vertices), len(body_vertices))
-    out = np.empty((frames - 1, len(faces), WIDTH), np.float32)
+    out = np.empty((frames - 1, len(faces), INTERACTION.width), np.float32)
     meshes = BodyMeshes(body_vertices[0].contiguous(), body_faces)
     for t in range(frames - 1):
         if t:
@@ -115,12 +109,13 @@ def pack(found: BodyInteraction) -> torch.Tensor:
 def unpack(rows: torch.Tensor) -> BodyInteraction:
     """[N, 16] -> BodyInteraction with body face -1 (what the feature kernel needs is all here)."""
     none = torch.full((len(rows),), -1, dtype=torch.int32, device=rows.device)
+    closest, sign, deformation, velocity = (rows[:, place] for place in INTERACTION.slices.values())
     return BodyInteraction(
-        closest=rows[:, COLUMNS["closest"]].contiguous(),
-        sign=rows[:, COLUMNS["sign"]].contiguous(),
+        closest=closest.contiguous(),
+        sign=sign.flatten().contiguous(),
         face=none,
-        deformation=rows[:, COLUMNS["deformation"]].reshape(-1, 3, 3).contiguous(),
-        velocity=rows[:, COLUMNS["velocity"]].contiguous(),
+        deformation=deformation.reshape(-1, 3, 3).contiguous(),
+        velocity=velocity.contiguous(),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, inverse_rest_frames
+from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.mesh.laplacian import components
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.layout import dense_weights
@@ -18,7 +19,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.training.data.sequence import Sequence
 
-from .interactions import COLUMNS, UnusableSequence, cached
+from .interactions import UnusableSequence, cached
 from .noise import NoiseBasis
 
 
@@ -63,7 +64,7 @@ class SequenceData:
         self.garment_weights = torch.as_tensor(share, dtype=torch.float32, device=device)  # [V]
         self.noise = NoiseBasis(np.asarray(garment.faces), vertex_component, np.asarray(garment.pins))
 
-        velocity = self.interaction[..., COLUMNS["velocity"]]
+        velocity = self.interaction[..., INTERACTION.slices["velocity"]]
         hot = torch.nn.functional.one_hot(self.face_component, self.components).to(velocity.dtype)
         hot = hot / hot.sum(dim=0).clamp(min=1.0)
         self.body_velocity = torch.einsum("fc,tfk->tck", hot, velocity)  # [T-1,C,3], over all faces

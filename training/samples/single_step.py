@@ -21,12 +21,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from warpgarment.kernels.deformation import (
-    deformation_gradient_from_inverse,
-    relative_deformation_gradient,
-    singular_values,
-)
-from warpgarment.kernels.features import FEATURES, LAYOUT, face_features
+from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
+from warpgarment.kernels.deformation.svd import singular_values
+from warpgarment.kernels.features.channels import FEATURES, INTERACTION, LAYOUT
+from warpgarment.kernels.features.face import face_features
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
@@ -34,8 +32,8 @@ from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
 from warpgarment.nn.patches.layout import Patches, PatchLayout, patch_layout
 
 from .augmentation import Augmentation, mirror
-from .drawing import Past, displacement, part_of, rest
-from .interactions import COLUMNS, unpack
+from .drawing import Past, displacement, part_of
+from .interactions import unpack
 from .noise import NoiseConfig
 from .recorded import SequenceData
 
@@ -123,7 +121,7 @@ class SampleBuilder:
         turn, similarity, joint, mirrored, scale = self._drawn(picks, streams)
 
         positions, following, corners, next_corners, means = [], [], [], [], []
-        rows = torch.empty(count, faces, history, 16, device=device)
+        rows = torch.empty(count, faces, history, INTERACTION.width, device=device)
         inverse_rest = torch.empty(count, faces, 3, 3, device=device)
         weights = None if self.patches else torch.empty(count, faces, faces, device=device)
         shown: list[Patches] = []
@@ -158,7 +156,7 @@ class SampleBuilder:
             velocity[b, : sequence.components] = sequence.component_weights @ after - centres[-1]
             body_velocity[b, : sequence.components] = sequence.body_velocity[t] @ similarity[b].mT
             rows[b] = sequence.interaction[begins.frames[None, :], seen[:, None]]
-            rest(rows[b, :, : begins.early])
+            rows[b, :, : begins.early] = INTERACTION.still(rows[b, :, : begins.early])
             inverse_rest[b] = sequence.inverse_rest[seen]
             chosen, vertices = sequence.faces[seen], past.shape[1]
             steps = torch.arange(history, dtype=torch.int32, device=device) * vertices + start
@@ -173,12 +171,12 @@ class SampleBuilder:
             inverse_rest = inverse_rest @ joint[:, None].mT
         if self.augmentation.scale:  # edges are longer, normals are not
             inverse_rest[:, :, :2] /= self._send(scale)[:, None, None, None]
-        self._turn(rows, turn, similarity, origin)
+        rows = self._turned(rows, turn, self._send(scale), origin)
         stacked = inverse_rest[:, :, None].expand(-1, -1, history, -1, -1).reshape(-1, 3, 3)
         garment = torch.arange(count * history, dtype=torch.int32, device=device).reshape(count, 1, history)
         features = face_features(
             stacked, torch.cat(positions), torch.cat(corners).reshape(-1, 3),
-            garment.expand(-1, faces, -1).reshape(-1).contiguous(), torch.cat(means), unpack(rows.reshape(-1, 16)),
+            garment.expand(-1, faces, -1).reshape(-1).contiguous(), torch.cat(means), unpack(rows.flatten(0, 2)),
         ).reshape(count, faces, history * FEATURES)  # fmt: skip
         phi_next = deformation_gradient_from_inverse(
             inverse_rest.reshape(-1, 3, 3), torch.cat(following), torch.cat(next_corners)
@@ -239,12 +237,7 @@ class SampleBuilder:
         return values.pin_memory().to(self.device, non_blocking=True)
 
     @staticmethod
-    def _turn(rows: torch.Tensor, turn: torch.Tensor, similarity: torch.Tensor, origin: torch.Tensor) -> None:
-        """Turns (and scales) interactions [B,N,H,16] in place, about each garment's origin."""
-        back = similarity.mT
-        flat = rows.flatten(1, 2)
-        flat[..., COLUMNS["closest"]] = (flat[..., COLUMNS["closest"]] - origin) @ back
-        flat[..., COLUMNS["velocity"]] = flat[..., COLUMNS["velocity"]] @ back
-        # (G D G^T) row-major is (G kron G) applied to D row-major
-        both = torch.einsum("bij,bkl->bikjl", turn, turn).reshape(-1, 9, 9)
-        flat[..., COLUMNS["deformation"]] = flat[..., COLUMNS["deformation"]] @ both.mT
+    def _turned(rows: torch.Tensor, turn: torch.Tensor, scale: torch.Tensor, origin: torch.Tensor) -> torch.Tensor:
+        """Interactions [B,N,H,16] turned and scaled about each garment's origin [B,1,3]."""
+        flat = INTERACTION.centred(rows.flatten(1, 2), origin)
+        return (flat @ INTERACTION.turn(turn, scale=scale).mT).reshape(rows.shape)

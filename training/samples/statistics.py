@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import torch
 
-from warpgarment.kernels.features.face import FEATURES
 from warpgarment.nn.network import GarmentNetwork
 
 from .single_step import Batch
@@ -23,7 +22,7 @@ def statistics(batches: Iterable[Batch], network: GarmentNetwork) -> dict[str, t
     samples: dict[str, list[torch.Tensor]] = {name: [] for name in FLOORS}
     for batch in batches:
         faces = slice(None) if batch.face_mask is None else batch.face_mask
-        samples["feature"].append(batch.features[faces].reshape(-1, FEATURES))
+        samples["feature"].append(network.read(batch.features[faces]).reshape(-1, network.channels.width))
         real = slice(None) if batch.velocity_mask is None else batch.velocity_mask
         samples["velocity"].append(batch.velocities[real].reshape(-1, 3))
         samples["psi"].append(batch.target.psi[faces].reshape(-1, 9))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgarment.kernels.features.face import FEATURES, LAYOUT
+from warpgarment.kernels.features.channels import FACE, FEATURES, INTERACTION
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
@@ -23,12 +23,10 @@ from warpgarment.sim.scene import Scene
 from warpgarment.sim.timing import Timings
 
 from .augmentation import Augmentation
-from .drawing import Past, displacement, part_of, rest
+from .drawing import Past, displacement, part_of
 from .interactions import unpack
 from .noise import NoiseConfig
 from .recorded import SequenceData
-
-_VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
 
 
 @dataclass(frozen=True)
@@ -72,13 +70,8 @@ def turned(
         turn: G, [R,3,3].
         joint: J, [R,3,3].
     """
-    both = torch.eye(FEATURES).to(turn).repeat(len(turn), 1, 1)
-    for name, right in (("deformation_gradient", joint), ("body_deformation", turn)):
-        both[:, LAYOUT[name], LAYOUT[name]] = torch.einsum("bij,bkl->bikjl", turn, right).reshape(-1, 9, 9)
-    for name in _VECTORS:
-        both[:, LAYOUT[name], LAYOUT[name]] = turn
     rows = features.unflatten(-1, (-1, FEATURES))
-    seen = (rows.flatten(1, 2) @ both.mT).reshape(features.shape)
+    seen = (rows.flatten(1, 2) @ FACE.turn(turn, joint).mT).reshape(features.shape)
     return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
 
 
@@ -138,7 +131,7 @@ class UnrolledBuilder:
             if delta is not None:
                 moved = moved + torch.from_numpy(begins.held(delta)).to(device)
             seen = data.interaction[begins.frames].clone()  # [H,F,16]
-            rest(seen[: begins.early])
+            seen[: begins.early] = INTERACTION.still(seen[: begins.early])
             past.append(moved)
             rows.append(seen)
             bodies.append(data.body_frames([int(begins.frames[0]), *range(t, t + self.steps + 1)]))

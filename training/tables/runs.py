@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +111,9 @@ def _complete(folder: Path, record: dict[str, Any], config: TrainConfig) -> Run:
     file = folder / str(record.get("file"))
     if not file.is_file() or _checksum(file) != record.get("sha256"):
         raise RunMismatch(f"{folder}: {file.name} is missing or another than {RECORD} says; remove the folder")
-    shape = asdict(checkpoint.read_metadata(file)[0])
-    if shape != asdict(config.network_config()):
-        raise RunMismatch(f"{file}: {'; '.join(differences(shape, asdict(config.network_config())))}")
+    shape = checkpoint.read_metadata(file)[0].as_dict()
+    if shape != config.network_config().as_dict():
+        raise RunMismatch(f"{file}: {'; '.join(differences(shape, config.network_config().as_dict()))}")
     error = record.get("validation")  # the name of a number, such as "inf", if all validation rollouts failed
     return Run(file, record.get("steps"), record.get("hours"), error if isinstance(error, float) else None)
 

@@ -44,7 +44,7 @@ def described(config: TrainConfig) -> dict[str, Any]:
     values = dataclasses.asdict(config)
     for name in (*HOW, "network", "overrides"):
         values.pop(name, None)
-    values["network"] = dataclasses.asdict(config.network_config())
+    values["network"] = config.network_config().as_dict()
     flat: dict[str, Any] = {}
 
     def add(prefix: str, value: Any) -> None:

@@ -35,7 +35,7 @@ from torch import nn
 
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
 from warpgarment.kernels.deformation.svd import singular_values
-from warpgarment.kernels.features.face import LAYOUT
+from warpgarment.kernels.features.channels import LAYOUT
 from warpgarment.nn.heading import canonical_frame
 from warpgarment.nn.network import GarmentNetwork, rotate_output
 from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets

@@ -36,6 +36,7 @@ LATER = {  # settings that older checkpoints do not have: their default is how i
     "face_embedding",
     "face_feed_forward",
     "face_layers",
+    "channels",
 }
 _DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
@@ -75,7 +76,7 @@ def save(
         "format": "pt",
         "kind": KIND,
         "format_version": str(FORMAT_VERSION),
-        "config": json.dumps(dataclasses.asdict(network.config)),
+        "config": json.dumps(network.config.as_dict()),
         "notes": json.dumps(dict(notes or {})),
     }
     if max_shard_bytes is not None:
@@ -220,6 +221,8 @@ def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
         raise CheckpointError(f"{path}: settings {', '.join(missing)} are missing")
     for name, value in settings.items():
         kind = type(fields[name].default)
+        if kind is tuple and isinstance(value, list) and all(isinstance(part, str) for part in value):
+            settings[name] = value = tuple(value)  # of which JSON has none
         fits = isinstance(value, (int, float)) if kind is float else isinstance(value, kind)
         if not fits or (isinstance(value, bool) and kind is not bool):
             raise CheckpointError(f"{path}: setting {name} must be {kind.__name__}, got {value!r}")

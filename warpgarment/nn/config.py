@@ -6,7 +6,20 @@ import dataclasses
 import math
 from typing import Any
 
+from warpgarment.kernels.features.channels import FACE
+
 from .attention import ACTIVATIONS
+
+CHANNELS = (  # those of the first networks: what a checkpoint that names none reads
+    "deformation_gradient",
+    "normal",
+    "centroid",
+    "signed_distance",
+    "direction_to_body",
+    "body_deformation",
+    "body_velocity",
+    "singular_values",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +46,7 @@ class NetworkConfig:
     face_embedding: int = 128
     face_feed_forward: int = 128
     face_layers: int = 2  # after the patches have been heard; one more goes before
+    channels: tuple[str, ...] = CHANNELS  # what it reads of a face in a frame, of kernels/features/channels.py
 
     def __post_init__(self) -> None:
         for name in ("embedding", "layers", "feed_forward", "heads", "face_embedding", "face_feed_forward"):
@@ -57,6 +71,21 @@ class NetworkConfig:
             raise ValueError(f'architecture must be "faces" or "patches", got {self.architecture!r}')
         if self.activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
+        if not self.channels:
+            raise ValueError(f"channels must name at least one of {', '.join(FACE.names)}")
+        FACE.only(self.channels)
+
+    @property
+    def features(self) -> int:
+        """Numbers that the network reads of a face in a frame: 34 of today's channels."""
+        return FACE.only(self.channels).width
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as files hold them; `channels` only where it differs from what all networks read at first."""
+        values = dataclasses.asdict(self)
+        if self.channels == CHANNELS:
+            del values["channels"]
+        return values
 
     @classmethod
     def base(cls, **changes: Any) -> NetworkConfig:

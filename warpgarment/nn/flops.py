@@ -33,7 +33,6 @@ from typing import Any
 
 import torch
 
-from warpgarment.kernels.features.face import FEATURES
 from warpgarment.nn.patches.layout import PatchLayout
 
 from .config import NetworkConfig
@@ -58,7 +57,8 @@ def forward_flops(config: NetworkConfig, faces: int, components: int, patches: i
     if config.architecture == "patches":
         return _forward_flops_patches(config, faces, components, patches)
     heads = 2 * config.embedding * (12 * faces + 3 * components)
-    embedding = 2 * config.embedding * (faces * config.history * FEATURES + components * 3 * (config.history - 1))
+    inputs = faces * config.history * config.features + components * 3 * (config.history - 1)
+    embedding = 2 * config.embedding * inputs
     layers, geodesic = _layer_flops(config, faces, components)
     return layers + heads, embedding + geodesic
 
@@ -74,7 +74,7 @@ def _layer_flops(config: NetworkConfig, nodes: int, components: int) -> tuple[in
 
 def _forward_flops_patches(config: NetworkConfig, faces: int, components: int, patches: int) -> tuple[int, int]:
     e, width = config.embedding, config.face_embedding
-    embedding = 2 * (width * faces * config.history * FEATURES + e * components * 3 * (config.history - 1))
+    embedding = 2 * (width * faces * config.history * config.features + e * components * 3 * (config.history - 1))
     layers, geodesic = _layer_flops(config, patches, components)
     layers += (6 * config.face_layers + 4) * faces * width * config.face_feed_forward + 4 * patches * width * e
     layers += 2 * components * width * (patches + e)

@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import torch
 
-from warpgarment.kernels.features.face import FEATURES, LAYOUT
-
-_VECTORS = ("normal", "centroid", "direction_to_body", "body_velocity")
+from warpgarment.kernels.features.channels import FACE, FEATURES, LAYOUT
 
 
 def yaw(deformation_gradient: torch.Tensor, face_mask: torch.Tensor | None = None) -> torch.Tensor:
@@ -58,21 +56,6 @@ def canonical_frame(face_features: torch.Tensor, face_mask: torch.Tensor | None 
     return rotation_about_up(-yaw(phi, face_mask))
 
 
-def feature_rotation(frame: torch.Tensor) -> torch.Tensor:
-    """The matrix that turns the 34 features of a face, [B,3,3] -> [B,34,34].
-
-    Row-major matrices turn by Kronecker products: vec(G A) = (G x I) vec(A), vec(G A G^T) = (G x G) vec(A).
-    """
-    turn = torch.eye(FEATURES, dtype=frame.dtype, device=frame.device).repeat(len(frame), 1, 1)
-    identity = torch.eye(3, dtype=frame.dtype, device=frame.device).expand_as(frame)
-    for name, right in (("deformation_gradient", identity), ("body_deformation", frame)):
-        place = LAYOUT[name]
-        turn[:, place, place] = torch.einsum("bij,bkl->bikjl", frame, right).reshape(-1, 9, 9)
-    for name in _VECTORS:
-        turn[:, LAYOUT[name], LAYOUT[name]] = frame
-    return turn
-
-
 def rotate_features(face_features: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:
     """Features of a garment and body turned by a rotation.
 
@@ -84,7 +67,7 @@ def rotate_features(face_features: torch.Tensor, frame: torch.Tensor) -> torch.T
         Shape [B,N,H*34].
     """
     per_frame = face_features.reshape(len(face_features), -1, FEATURES)
-    return torch.bmm(per_frame, feature_rotation(frame).mT).reshape(face_features.shape)
+    return torch.bmm(per_frame, FACE.turn(frame).mT).reshape(face_features.shape)
 
 
 def rotate_vectors(vectors: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:

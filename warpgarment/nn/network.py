@@ -21,14 +21,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from warpgarment.kernels.features.face import FEATURES
+from warpgarment.kernels.features.channels import FACE, FEATURES
 
 from . import heading as _heading
 from .attention import EncoderLayer
 from .config import NetworkConfig
 from .parametrisation import NetworkOutput
 
-STATISTICS = {  # buffers of the normalisation and their lengths
+STATISTICS = {  # buffers of the normalisation and their lengths; of features that of all channels
     "feature_mean": FEATURES,
     "feature_std": FEATURES,
     "velocity_mean": 3,
@@ -94,7 +94,9 @@ class GarmentNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
+        self.channels = FACE.only(config.channels)
         for name, length in STATISTICS.items():
+            length = self.channels.width if name.startswith("feature_") else length
             start = torch.zeros(length) if name.endswith("_mean") else torch.ones(length)
             self.register_buffer(name, start)
         self.psi_mean.copy_(torch.eye(3).flatten())
@@ -172,8 +174,14 @@ class GarmentNetwork(nn.Module):
 
     def encode(self, face_features: torch.Tensor, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Normalises (canonical) inputs; the same statistics serve all frames of the history."""
-        x = (face_features.unflatten(-1, (-1, FEATURES)) - self.feature_mean) / self.feature_std
+        x = (self.read(face_features).unflatten(-1, (-1, self.channels.width)) - self.feature_mean) / self.feature_std
         return x.flatten(-2), self.encode_velocities(velocities)
+
+    def read(self, face_features: torch.Tensor) -> torch.Tensor:
+        """Those of the features [...,H*34] that this network reads, `config.channels`; [...,H*K]."""
+        if self.channels.names == FACE.names:
+            return face_features
+        return FACE.take(face_features.unflatten(-1, (-1, FEATURES)), self.channels.names).flatten(-2)
 
     def encode_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
         """Normalises (canonical) velocities."""
@@ -219,8 +227,9 @@ class GarmentNetwork(nn.Module):
             if name not in STATISTICS:
                 raise ValueError(f"unknown statistic {name!r}; there are {', '.join(STATISTICS)}")
             value = torch.as_tensor(value, dtype=torch.float32)
-            if tuple(value.shape) != (STATISTICS[name],):
-                raise ValueError(f"{name} must have shape [{STATISTICS[name]}], got {list(value.shape)}")
+            length = len(getattr(self, name))
+            if tuple(value.shape) != (length,):
+                raise ValueError(f"{name} must have shape [{length}], got {list(value.shape)}")
             if not torch.isfinite(value).all():
                 raise ValueError(f"{name} is not finite")
             if name.endswith("_std") and (value <= 0.0).any():

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 
 from warpgarment.kernels.deformation.svd import rotation
-from warpgarment.kernels.features.face import FEATURES, LAYOUT
+from warpgarment.kernels.features.channels import FEATURES, LAYOUT
 
 
 class NetworkOutput(NamedTuple):

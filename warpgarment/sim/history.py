@@ -10,7 +10,7 @@ import dataclasses
 
 import torch
 
-from warpgarment.kernels.features.face import LAYOUT
+from warpgarment.kernels.features.channels import FACE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,10 +32,7 @@ class History:
             components: Number of connected components C.
             frames: H.
         """
-        still = features.clone()
-        still[:, LAYOUT["body_deformation"]] = torch.eye(3).flatten().to(features)
-        still[:, LAYOUT["body_velocity"]] = 0.0
-        repeated = still[:, None].expand(-1, frames - 1, -1)
+        repeated = FACE.still(features)[:, None].expand(-1, frames - 1, -1)
         return cls(repeated, features.new_zeros((components, frames - 1, 3)))
 
     def stacked(self, newest: torch.Tensor) -> torch.Tensor:

@@ -20,7 +20,7 @@ import torch
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
 from warpgarment.kernels.collision.solver import compliance
-from warpgarment.kernels.features.face import FEATURES
+from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.kernels.linear import factor
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.rows import row_groups

@@ -9,7 +9,8 @@ import torch
 
 from tests.support.comparing import close
 from warpgarment.kernels.deformation.gradients import face_centroids, inverse_rest_frames, segment_mean
-from warpgarment.kernels.features.face import FEATURES, body_interaction, face_features
+from warpgarment.kernels.features.channels import FEATURES
+from warpgarment.kernels.features.face import body_interaction, face_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn import heading
 from warpgarment.nn.attention import EncoderLayer, ManifoldAwareAttention, geodesic_weights

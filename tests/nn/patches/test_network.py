@@ -16,7 +16,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
 from warpgarment.errors import CheckpointError
-from warpgarment.kernels.features.face import FEATURES
+from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.nn import checkpoint
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig

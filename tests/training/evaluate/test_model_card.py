@@ -262,9 +262,9 @@ def test_an_evaluation_from_before_a_setting_came(evaluated, tmp_path):
     their defaults in them."""
     path = edited(evaluated, tmp_path / "e.json", lambda r: r["network"]["config"].pop("replace_singular_values"))
     settings, notes = checkpoint.read_metadata(checkpoint.find(config(evaluated, tmp_path).network))
-    assert model_card.read_evaluation(path, vars(settings), notes)["sequences"]
+    assert model_card.read_evaluation(path, settings.as_dict(), notes)["sequences"]
     with pytest.raises(CardError, match="is of another network"):
-        model_card.read_evaluation(path, vars(settings) | {"replace_singular_values": False}, notes)
+        model_card.read_evaluation(path, settings.as_dict() | {"replace_singular_values": False}, notes)
 
 
 def test_files_that_are_missing(evaluated, tmp_path):

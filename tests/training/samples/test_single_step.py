@@ -13,7 +13,8 @@ import torch
 from support import sequences as synthetic_sequences
 
 from warpgarment.kernels.deformation.gradients import deformation_gradient
-from warpgarment.kernels.features.face import FEATURES, LAYOUT, body_interaction, face_features
+from warpgarment.kernels.features.channels import FEATURES, LAYOUT
+from warpgarment.kernels.features.face import body_interaction, face_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig

@@ -7,7 +7,7 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from warpgarment.kernels.features.face import FEATURES
+from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.nn.flops import forward_flops, peak_of, step_flops

@@ -13,7 +13,6 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from warpgarment.kernels.features.face import FEATURES
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.network import STATISTICS, GarmentNetwork, NormalisedOutput, rotate_output
@@ -51,7 +50,7 @@ class ManifoldAwareTransformer(GarmentNetwork):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
-        self.embed_faces = nn.Linear(config.history * FEATURES, config.embedding)
+        self.embed_faces = nn.Linear(config.history * config.features, config.embedding)
         self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
         self.layers = self.encoder_layers()
         self.final_norm = nn.LayerNorm(config.embedding) if config.norm_first else nn.Identity()

@@ -20,7 +20,6 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from warpgarment.kernels.features.face import FEATURES
 from warpgarment.nn import heading
 from warpgarment.nn.attention import ACTIVATIONS
 from warpgarment.nn.config import NetworkConfig
@@ -74,7 +73,7 @@ class PatchTransformer(GarmentNetwork):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         width = config.face_embedding
-        self.embed_faces = nn.Linear(config.history * FEATURES, width)
+        self.embed_faces = nn.Linear(config.history * config.features, width)
         self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
         self.before = self._face_layer(hears=False)
         self.to_patches = nn.Linear(width, config.embedding)
@@ -148,7 +147,7 @@ class PatchTransformer(GarmentNetwork):
                 velocities = heading.rotate_vectors(velocities, frame)
             if face_mask is not None:
                 face_features = torch.where(face_mask[..., None], face_features, 0.0)
-            faces = self._embedded(face_features, frame)
+            faces = self._embedded(self.read(face_features), frame)
             tokens = self.embed_velocity(self._without_padding(self.encode_velocities(velocities), velocity_mask))
         with torch.autocast(kind, dtype=torch.get_autocast_dtype(kind), enabled=half):
             normalised = self._from_embeddings(faces, tokens, weights, velocity_mask)
@@ -160,11 +159,11 @@ class PatchTransformer(GarmentNetwork):
 
         W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
         """
-        scaled = self.embed_faces.weight.unflatten(1, (-1, FEATURES)) / self.feature_std  # [E,H,34]
+        scaled = self.embed_faces.weight.unflatten(1, (-1, self.channels.width)) / self.feature_std  # [E,H,K]
         bias = self.embed_faces.bias - scaled.sum(dim=1) @ self.feature_mean
         if frame is None:
             return F.linear(face_features, scaled.flatten(1), bias)
-        turned = torch.einsum("ehi,bij->behj", scaled, heading.feature_rotation(frame)).flatten(2)
+        turned = torch.einsum("ehi,bij->behj", scaled, self.channels.turn(frame)).flatten(2)
         if len(turned) == 1:
             return F.linear(face_features, turned[0], bias)
         return torch.baddbmm(bias, face_features, turned.mT)
