@@ -6,8 +6,8 @@
 #           random ones: thousands of times LAPACK's float32 error. The iteration stops after a fixed number of sweeps;
 #           the singular values alone are better than the rotations. In mat33d the same call is exact to 1e-13.
 # Versions: warp-lang 1.19.0, numpy 2.4.6, on the CPU.
-# So:       strain limits, polar decompositions and principal stretches of cloth (percents) come out with errors of
-#           tenths of a percent. Cast to mat33d first. See kernels/singular_values.py.
+# So:       whatever is put together again from U and V (strain limiting, polar decomposition) is off by a tenth of a
+#           percent, where cloth stretches by percents. Cast to mat33d first. See kernels/singular_values.py.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
