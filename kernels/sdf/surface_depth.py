@@ -37,7 +37,6 @@ STANDS_OUT = wp.constant(0.01)
 class SurfaceDepth(NamedTuple):
     """What `surface_depth` finds [m], float32, at least 0."""
 
-    vertices: torch.Tensor  # depth of each vertex, [V]
     garments: torch.Tensor  # of each garment's deepest point, [B]
     missing: torch.Tensor  # at each vertex, how much deeper its edges and faces are than their corners, [V]
 
@@ -229,4 +228,4 @@ def surface_depth(
             outputs=results[1:],
             device=warp_device,
         )
-    return SurfaceDepth(depth, deepest, missing)
+    return SurfaceDepth(deepest, missing)
