@@ -40,8 +40,7 @@ STANDS_OUT = wp.constant(0.01)
 class SurfaceDepth(NamedTuple):
     """Depths that `surface_depth` returns, all in metres, float32 and at least 0."""
 
-    vertices: torch.Tensor  # depth of each vertex, [V]
-    garments: torch.Tensor  # depth of each garment's deepest point, [B]
+    garments: torch.Tensor  # of each garment's deepest point, [B]
     missing: torch.Tensor  # at each vertex, how much deeper its edges and faces are than their corners, [V]
 
 
@@ -234,4 +233,4 @@ def surface_depth(
             outputs=results[1:],
             device=warp_device,
         )
-    return SurfaceDepth(depth, deepest, missing)
+    return SurfaceDepth(deepest, missing)

@@ -104,7 +104,11 @@ def test_prediction(garments, config, options):
     arrays = [] if config is FAST else [a for g in unique for a in (g.pooled_geodesics if g.pools else [g.geodesics])]
     distances = sum(array.nbytes for array in arrays)
     measured = allocated(run)
-    factors = sum(tensor.nbytes for solver in (scenes[0].poisson, scenes[0].collision) for tensor in factor_of(solver))
+    factors = sum(
+        tensor.nbytes
+        for solver in (scenes[0].reconstruct.solver, scenes[0].contact.solver)
+        for tensor in factor_of(solver)
+    )
     measured += distances + factors
     predicted = memory.predict(garments, [motion], config, **options)
     assert predicted.parts["geodesic distances"] == distances
