@@ -9,12 +9,12 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.polygons import triangulate_counts
+from warpgarment.io.times import Frames, frames_of
 
 from .skeleton import Skinning, skinning_of
-from .times import Frames, frames_of
 from .writing import pxr
 
-LARGEST = 4 << 30  # bytes of positions beyond which a file must have as many samples
+LARGEST = 512 << 20  # bytes of positions beyond which there must be a sample for every other frame
 
 
 class UsdMesh(NamedTuple):
