@@ -107,6 +107,8 @@ def _read(source: Source, unit: str | None, rates: dict[str, float]) -> tuple[Pa
     name = mesh.rsplit("/", 1)[-1] if mesh else path.stem
     if data.fps is not None:
         rates[f"{path.name}{f' ({mesh})' if mesh else ''}"] = float(data.fps)
+    elif data.step != 1:
+        rates[path.name] = FPS / data.step
     return path, name, data
 
 

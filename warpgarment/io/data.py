@@ -37,6 +37,8 @@ class MotionData(NamedTuple):
         collider_faces: Faces that take part in collisions, bool [F]; None: all.
         name: Of the mesh inside the file; empty where it has none.
         extra: Further arrays by name, in formats that keep them.
+        step: How many frames of the rate lie between two of these, as the file says; `fps` is for one of them.
+        start: Number of the first frame, in steps.
     """
 
     vertices: np.ndarray
@@ -45,6 +47,8 @@ class MotionData(NamedTuple):
     collider_faces: np.ndarray | None = None
     name: str = ""
     extra: Mapping[str, np.ndarray] = {}
+    step: float = 1.0
+    start: float = 0.0
 
 
 class ReadOptions(NamedTuple):
@@ -53,17 +57,20 @@ class ReadOptions(NamedTuple):
     Attributes:
         mesh: Name of the mesh to read, where the file holds several; None: the only one.
         unit: Length unit of the file, a key of `UNITS`; None: the one that the file names, otherwise metres.
+        up: Axis that points up in the file, "y" or "z"; None: the one that the file names, otherwise Y.
     """
 
     mesh: str | None = None
     unit: str | None = None
+    up: str | None = None
 
 
 class Format(NamedTuple):
     """A file format: four functions, each None where the format has no such thing.
 
-    The functions that read get a path that exists. They return positions with Y up, in metres where the file names its
-    unit and `ReadOptions.unit` is None, otherwise in the numbers of the file, which `io.files` then scales. They raise
+    The functions that read get a path that exists. They return positions in metres where the file names its unit and
+    `ReadOptions.unit` is None, otherwise in the numbers of the file, which `io.files` then scales; likewise with Y up
+    where the file names its axis and `ReadOptions.up` is None, otherwise with the axes of the file. They raise
     MeshError, beginning with the path, for a file that is damaged, cut short or of another kind; the arrays are checked
     (indices in range, finite positions) by the objects made of them. A mesh is also a motion of one frame: a format
     whose motions are nothing more leaves `read_motion` out.
@@ -77,6 +84,7 @@ class Format(NamedTuple):
         read_motion: Reads a mesh in motion.
         write_motion: Writes one.
         only_read: Suffixes of the format that are read and never written.
+        named: Whether meshes in a file have names; otherwise `ReadOptions.mesh` is refused before reading.
     """
 
     extra: str | None = None
@@ -85,6 +93,7 @@ class Format(NamedTuple):
     read_motion: Callable[[Path, ReadOptions], MotionData] | None = None
     write_motion: Callable[[Path, MotionData], None] | None = None
     only_read: tuple[str, ...] = ()
+    named: bool = False
 
 
 def scale_of(unit: str | None) -> float:

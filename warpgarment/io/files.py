@@ -13,17 +13,21 @@ import numpy as np
 from warpgarment.errors import MeshError
 
 from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
+from .parts import unnamed
 
 # Suffixes -> the module whose FORMAT reads and writes them; "" is a folder. docs/extending_files.md adds one.
 FORMATS: dict[tuple[str, ...], str] = {
     (".obj",): "warpgarment.io.obj",
     (".ply",): "warpgarment.io.ply",
+    (".off",): "warpgarment.io.off",
     (".npz",): "warpgarment.io.npz",
-    (".stl", ".glb", ".gltf"): "warpgarment.io.joined",
+    (".stl",): "warpgarment.io.stl",
+    (".glb", ".gltf"): "warpgarment.io.gltf",
     (".usd", ".usda", ".usdc", ".usdz"): "warpgarment.io.usd",
     (".pc2",): "warpgarment.io.pc2",
     ("",): "warpgarment.io.folder",
 }
+ASSUMED = 30.0  # frames a second where nobody says
 BIGGEST, SMALLEST = 10.0, 0.05  # sizes [m] beyond which a garment's unit is probably another
 
 Ability = Literal["read_mesh", "write_mesh", "read_motion", "write_motion"]
@@ -53,51 +57,82 @@ def listed(names: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
 
-def read_mesh(path: Path, *, unit: str | None = None, mesh: str | None = None, expect_garment: bool = True) -> MeshData:
+def read_mesh(
+    path: Path,
+    *,
+    unit: str | None = None,
+    mesh: str | None = None,
+    up: str | None = None,
+    expect_garment: bool = True,
+) -> MeshData:
     """Reads a mesh as `Garment.load` describes; the arrays are not checked beyond the format.
 
     Args:
         path: The file.
         unit: See `Garment.load`.
         mesh: See `Garment.load`.
+        up: See `Garment.load`.
         expect_garment: Warn about sizes that no garment has.
 
     Raises:
         MeshError: Not a file of its kind, cut short, or a suffix that is not known.
         FileNotFoundError: There is no such file.
     """
-    path, scale = Path(path), scale_of(unit)
-    format = _reader(path, "read_mesh")
+    path, scale, options = Path(path), scale_of(unit), ReadOptions(mesh, unit, _axis(up))
+    format = _reader(path, "read_mesh", options)
     assert format.read_mesh is not None
-    data = format.read_mesh(path, ReadOptions(mesh, unit))
-    if scale != 1.0:
-        data = data._replace(vertices=np.asarray(data.vertices, dtype=np.float64) * scale)
+    data = format.read_mesh(path, options)
+    data = data._replace(vertices=_placed(data.vertices, scale, up))
     if expect_garment:
         _warn_about_size(path, np.asarray(data.vertices), scale)
     return data
 
 
-def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None) -> MotionData:
+def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None, up: str | None = None) -> MotionData:
     """Reads a moving mesh as `BodyMotion.load` describes; the arrays are not checked beyond the format.
 
     Args:
         path: File or folder.
         unit: See `BodyMotion.load`.
         mesh: See `BodyMotion.load`.
+        up: See `BodyMotion.load`.
 
     Raises:
         MeshError: Not a file of its kind, cut short, arrays that do not fit each other, or a suffix that is not known.
         FileNotFoundError: There is no such file.
     """
-    path, scale = Path(path), scale_of(unit)
-    format, options = _reader(path, "read_motion"), ReadOptions(mesh, unit)
+    path, scale, options = Path(path), scale_of(unit), ReadOptions(mesh, unit, _axis(up))
+    format = _reader(path, "read_motion", options)
     if format.read_motion is not None:
         data = format.read_motion(path, options)
     else:
         assert format.read_mesh is not None
         single = format.read_mesh(path, options)
         data = MotionData(np.asarray(single.vertices)[None], single.faces, name=single.name)
-    return data if scale == 1.0 else data._replace(vertices=np.asarray(data.vertices, dtype=np.float64) * scale)
+    return data._replace(vertices=_placed(data.vertices, scale, up))
+
+
+def rate_of(path: Path, data: MotionData, fps: float | None) -> float:
+    """Frames per second of a motion that was read: the user's, else the file's, else 30, with a warning.
+
+    A format that says how many frames lie between two samples (`MotionData.step`) has as many fewer a second.
+
+    Args:
+        path: The file, for the message.
+        data: What was read.
+        fps: What the user says.
+
+    Warns:
+        UserWarning: Nobody says, and there is more than one frame.
+    """
+    if fps is None and data.fps is None and len(data.vertices) > 1:
+        warnings.warn(
+            f"{path}: the file has no rate; {ASSUMED:g} frames a second are assumed. Give it with fps=.",
+            UserWarning,
+            stacklevel=3,
+        )
+    rate = fps if fps is not None else data.fps if data.fps is not None else ASSUMED
+    return rate / data.step
 
 
 def write_mesh(path: Path, data: MeshData) -> None:
@@ -130,13 +165,33 @@ def write_motion(path: Path, data: MotionData) -> None:
     format.write_motion(Path(path), data)
 
 
-def _reader(path: Path, ability: Literal["read_mesh", "read_motion"]) -> Format:
+def _axis(up: str | None) -> str | None:
+    if up not in (None, "y", "z"):
+        raise ValueError(f'up must be "y" or "z", got {up!r}')
+    return up
+
+
+def _placed(vertices: np.ndarray, scale: float, up: str | None) -> np.ndarray:
+    """Positions in metres and Y up, of numbers of another unit or axis; what is no array of numbers stays."""
+    if scale == 1.0 and up != "z":
+        return vertices
+    array = np.asarray(vertices)
+    if array.dtype.kind not in "fiu" or array.ndim < 2 or array.shape[-1] != 3:
+        return vertices
+    if up == "z":
+        array = np.stack([array[..., 0], array[..., 2], -array[..., 1]], axis=-1)
+    return array.astype(np.float64) * scale if scale != 1.0 else array
+
+
+def _reader(path: Path, ability: Literal["read_mesh", "read_motion"], options: ReadOptions) -> Format:
     if not path.exists():
         raise FileNotFoundError(f"No such file: {path}")
     suffix, able = "" if path.is_dir() else path.suffix.lower(), suffixes(ability)
     if suffix in able and (suffix or path.is_dir()):
         format = format_of(suffix)
         assert format is not None
+        if not format.named:
+            unnamed(path, options.mesh)
         return format
     kind = "a folder" if path.is_dir() else suffix or "files without a suffix"
     raise MeshError(f"{path}: cannot read {kind}{' as a mesh' if ability == 'read_mesh' else ''}; use {listed(able)}.")

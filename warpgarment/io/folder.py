@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import warnings
+from math import gcd
 from pathlib import Path
 
 import numpy as np
@@ -11,34 +13,90 @@ from warpgarment.errors import MeshError
 
 from .atomic import atomic_folder
 from .data import Format, MotionData, ReadOptions
-from .obj import obj_text, read_polygons
-from .polygons import triangulate
+from .obj import chosen_polygons, obj_text, read_polygons
+from .polygons import triangulate_counts
 
 FRAME = "frame_*.obj"
+LONGEST = 10_000  # frames that are missing in a row
 
 
 def read_folder(path: Path, options: ReadOptions) -> MotionData:
-    """The frames of a folder, in the order of the numbers in their names.
+    """The frames of a folder, at the numbers that their names end in.
+
+    Hidden files are passed over. Numbers in even steps (every second frame) are frames so far apart; where single ones
+    are missing, positions between are interpolated, with a warning.
 
     Raises:
-        MeshError: No .obj files, one that cannot be read, or frames of different topology.
+        MeshError: No .obj files, one that cannot be read, numbers that occur twice or leave out far too many, or frames
+            of different topology.
     """
     files = sorted(
-        path.glob("*.obj"), key=lambda file: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", file.name)]
+        (file for file in path.iterdir() if file.suffix.lower() == ".obj" and not file.name.startswith(".")),
+        key=lambda file: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", file.name)],
     )
     if not files:
         raise MeshError(f"{path}: no .obj files in this folder.")
-    first, polygons = read_polygons(files[0])
-    frames = [first]
+    first = read_polygons(files[0])
+    used, _, counts, corners = chosen_polygons(files[0], first, options.mesh)
+    frames = [first.vertices[used]]
     for file in files[1:]:
-        vertices, same = read_polygons(file)
-        if vertices.shape != first.shape or same != polygons:
+        found = read_polygons(file)
+        same = np.array_equal(found.counts, first.counts) and np.array_equal(found.corners, first.corners)
+        if found.vertices.shape != first.vertices.shape or not same:
             raise MeshError(
-                f"{file}: {len(vertices):,} vertices and {len(same):,} faces, unlike {files[0].name} with "
-                f"{len(first):,} and {len(polygons):,}, or in another order. All frames must share one topology."
+                f"{file}: {len(found.vertices):,} vertices and {len(found.counts):,} faces, unlike {files[0].name} "
+                f"with {len(first.vertices):,} and {len(first.counts):,}, or in another order. All frames must share "
+                "one topology."
             )
-        frames.append(vertices)
-    return MotionData(np.stack(frames).astype(np.float32), triangulate(first, polygons))
+        frames.append(found.vertices[used])
+    try:
+        faces = triangulate_counts(frames[0], counts, corners)
+    except MeshError as error:
+        raise MeshError(f"{files[0]}: {error}") from None
+    numbers = _numbers(files)
+    step, vertices = _spread(path, numbers, np.stack(frames))
+    with np.errstate(over="ignore"):
+        return MotionData(vertices.astype(np.float32), faces, step=step, start=numbers[0] / step)
+
+
+def _numbers(files: list[Path]) -> list[int]:
+    """Frame numbers: the last number in each name, where every name has one, otherwise the places in the list."""
+    found = [re.findall(r"\d+", file.stem) for file in files]
+    if not all(found):
+        return list(range(len(files)))
+    numbers = [int(words[-1][:15]) for words in found]
+    return numbers if (np.diff(numbers) > 0).all() else list(range(len(files)))
+
+
+def _spread(path: Path, numbers: list[int], frames: np.ndarray) -> tuple[int, np.ndarray]:
+    """Numbers from one frame to the next, and frames [T,V,3] without gaps."""
+    gaps = np.diff(numbers)
+    if len(gaps) == 0:
+        return 1, frames
+    step = gcd(*gaps.tolist())
+    if gaps.max() == step:
+        if step > 1:
+            warnings.warn(
+                f"{path}: the numbers of the frames go from {numbers[0]} to {numbers[-1]} in steps of {step}: they are "
+                f"{step} frames of the rate apart.",
+                UserWarning,
+                stacklevel=6,
+            )
+        return step, frames
+    if gaps.max() > LONGEST * step:
+        raise MeshError(f"{path}: no frames between the numbers {numbers[gaps.argmax()]} and "
+                        f"{numbers[gaps.argmax() + 1]}: is it one sequence?")  # fmt: skip
+    wanted = np.arange(numbers[0], numbers[-1] + 1, step)
+    warnings.warn(
+        f"{path}: {len(wanted) - len(numbers):,} of {len(wanted):,} frames are missing (first: number "
+        f"{sorted(set(wanted.tolist()) - set(numbers))[0]}). The gaps are filled in a straight line.",
+        UserWarning,
+        stacklevel=6,
+    )
+    before = np.clip(np.searchsorted(numbers, wanted, side="right") - 1, 0, len(numbers) - 2)
+    at = np.array(numbers)
+    share = ((wanted - at[before]) / (at[before + 1] - at[before]))[:, None, None]
+    return step, frames[before] * (1 - share) + frames[before + 1] * share
 
 
 def write_folder(path: Path, data: MotionData) -> None:
@@ -50,4 +108,4 @@ def write_folder(path: Path, data: MotionData) -> None:
             (folder / f"frame_{frame:0{digits}d}.obj").write_text(text, encoding="utf-8")
 
 
-FORMAT = Format(read_motion=read_folder, write_motion=write_folder)
+FORMAT = Format(read_motion=read_folder, write_motion=write_folder, named=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
@@ -17,9 +18,11 @@ from warpgarment.geometry.skinning import linear_blend_skinning
 
 from .atomic import atomic_file
 from .data import Format, MeshData, MotionData, ReadOptions
+from .parts import ALL, Parts, named
 
 MAGIC = b"\x93NUMPY"
 LARGE, RATIO = 64 << 20, 100  # bytes of an array from which on it is asked how much smaller it is in the file
+RATE = re.compile(r".*fps|.*framerate|framespersecond|sampl(e|ing)rate")  # letters of the names that rates have
 SKINNED = ("rest_vertices", "faces", "bone_indices", "bone_weights", "bone_transforms")
 
 
@@ -100,13 +103,16 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
     arrays = read_npz(path, ("vertices", "faces"), {"vertices", "faces", "pins", "name"}.__contains__)
+    _check_name(path, arrays, options.mesh)
     return MeshData(arrays["vertices"], arrays["faces"], arrays.get("pins"), _name(arrays))
 
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     """Positions, or a rest mesh with bones that move it."""
-    known = {"vertices", "fps", "collider_faces", *SKINNED}
-    arrays = read_npz(path, ("faces",), lambda key: key in known or key == "name" or key.startswith("status_"))
+    known = {"vertices", "collider_faces", *SKINNED}
+    arrays = read_npz(
+        path, ("faces",), lambda key: key in known or key == "name" or key.startswith("status_") or _is_rate(key)
+    )
     if "vertices" in arrays:
         vertices = arrays["vertices"]
         vertices = vertices[None] if vertices.ndim == 2 else vertices
@@ -120,12 +126,33 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
             vertices = linear_blend_skinning(*(arrays[k] for k in ("rest_vertices", *SKINNED[2:])))
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
-    try:
-        fps = float(arrays["fps"]) if "fps" in arrays else None
-    except (TypeError, ValueError):
-        raise MeshError(f"{path}: fps must be a single number.") from None
-    extra = {key: array for key, array in arrays.items() if key not in known}
+    _check_name(path, arrays, options.mesh)
+    fps = _rate(path, arrays)
+    extra = {key: array for key, array in arrays.items() if key not in known and not _is_rate(key)}
     return MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
+
+
+def _is_rate(key: str) -> bool:
+    return RATE.fullmatch(re.sub(r"[^a-z]", "", key.lower())) is not None
+
+
+def _rate(path: Path, arrays: Mapping[str, np.ndarray]) -> float | None:
+    """Frames per second under one of the names that people use; None where there is none."""
+    found: dict[str, float] = {}
+    for key in filter(_is_rate, arrays):
+        try:
+            found[key] = float(arrays[key].reshape(()))
+        except (TypeError, ValueError):
+            raise MeshError(f"{path}: {key} must be a single number.") from None
+    if len(set(found.values())) > 1:
+        listed = ", ".join(f"{key} {rate:g}" for key, rate in found.items())
+        raise MeshError(f"{path}: rates that differ: {listed}. Keep one of them.")
+    return next(iter(found.values()), None)
+
+
+def _check_name(path: Path, arrays: Mapping[str, np.ndarray], mesh: str | None) -> None:
+    if mesh not in (None, ALL):
+        named(path, mesh, Parts([_name(arrays)], np.zeros(1, dtype=int)))
 
 
 def _name(arrays: Mapping[str, np.ndarray]) -> str:
@@ -142,4 +169,4 @@ def _write_motion(path: Path, data: MotionData) -> None:
     write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **rate, **data.extra})
 
 
-FORMAT = Format(read_mesh=_read_mesh, write_mesh=_write_mesh, read_motion=_read_motion, write_motion=_write_motion)
+FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True)

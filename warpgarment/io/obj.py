@@ -6,8 +6,11 @@ vertex.
 
 from __future__ import annotations
 
+import codecs
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,36 +18,103 @@ from warpgarment.errors import MeshError
 
 from .atomic import atomic_file
 from .data import Format, MeshData, ReadOptions
-from .polygons import triangulate
+from .parts import ALL, Parts, connected_pieces, listed, named, unconnected, used_only
+from .polygons import triangulate_counts
+
+CONTINUED = ("v", "f", "vt", "vn", "vp", "l", "p")  # lines of numbers, which a backslash at the end continues
 
 
-def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
+class ObjMesh(NamedTuple):
+    """What an OBJ file holds.
+
+    Attributes:
+        vertices: Positions, float64 [V,3].
+        counts: Corners of each polygon [P].
+        corners: Vertices of the corners, end to end.
+        objects: By the `o` line above each polygon.
+        groups: By the `g` line above each polygon.
+    """
+
+    vertices: np.ndarray
+    counts: np.ndarray
+    corners: np.ndarray
+    objects: Parts
+    groups: Parts
+
+
+def read_obj(path: Path, mesh: str | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of an OBJ file.
 
-    Reads `v` (further numbers such as colours are ignored) and `f` with `a`, `a/b`, `a//c` or `a/b/c`, negative
-    indices, lines continued with a backslash; everything else is skipped.
+    Reads `v` (further numbers such as colours are ignored), `f` with `a`, `a/b`, `a//c` or `a/b/c`, negative indices,
+    lines of numbers continued with a backslash, `o` and `g`; everything else is skipped.
 
     Args:
         path: The file.
+        mesh: Name of an object, else of a group; "*" reads everything as one mesh.
 
     Returns:
-        Vertices float32 [V,3] in the file's unit, faces int64 [F,3].
+        Vertices float32 [V,3] in the file's unit, faces int64 [F,3]. Where a part is read, those vertices that its
+        faces name, in the file's order.
 
     Raises:
-        MeshError: Not an OBJ file, cut short, or a face names a vertex that does not exist; with the line.
+        MeshError: Not an OBJ file, cut short, or a face names a vertex that does not exist, with the line; no such
+            part; or several objects that are not connected, and none was named.
+
+    Warns:
+        UserWarning: Several groups that are not connected, and none was named.
     """
-    vertices, polygons = read_polygons(path)
-    return vertices.astype(np.float32), triangulate(vertices, polygons)
+    vertices, counts, corners = chosen_polygons(path, read_polygons(path), mesh)[1:]
+    with np.errstate(over="ignore"):
+        return vertices.astype(np.float32), _triangles(path, vertices, counts, corners)
 
 
-def read_polygons(path: Path) -> tuple[np.ndarray, list[list[int]]]:
-    """Vertices, float64 [V,3], and corners of each polygon of an OBJ file; otherwise as `read_obj`."""
+def _triangles(path: Path, vertices: np.ndarray, counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    try:
+        return triangulate_counts(vertices, counts, corners)
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from None
+
+
+def chosen_polygons(
+    path: Path, found: ObjMesh, mesh: str | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The part that `read_obj` reads: indices of its vertices in the file, and vertices, counts, corners."""
+    everything = np.arange(len(found.vertices)), found.vertices, found.counts, found.corners
+    if mesh == ALL:
+        return everything
+    if mesh is None:
+        pieces = connected_pieces(len(found.vertices), found.counts, found.corners)
+        objects = found.objects.used()
+        if unconnected(found.objects, pieces):
+            raise MeshError(
+                f"{path}: {len(objects)} objects: {listed(objects)}. Name one with mesh=, or read them as one with "
+                f'mesh="{ALL}".'
+            )
+        if len(objects) < 2 and unconnected(found.groups, pieces):  # they may as well be panels of one garment
+            names = found.groups.used()
+            warnings.warn(
+                f"{path}: {len(names)} groups that are not connected are read as one mesh: {listed(names)}. "
+                "Name one with mesh=.",
+                UserWarning,
+                stacklevel=7,
+            )
+        return everything
+    polygons = named(path, mesh, found.objects, found.groups)
+    used, corners = used_only(len(found.vertices), found.corners[np.repeat(polygons, found.counts)])
+    return used, found.vertices[used], found.counts[polygons], corners
+
+
+def read_polygons(path: Path) -> ObjMesh:
+    """An OBJ file as it is; raises as `read_obj`."""
     vertices: list[list[float]] = []
-    polygons: list[list[int]] = []
+    counts: list[int] = []
+    corners: list[int] = []
+    objects, groups = {"": 0}, {"": 0}
+    of_object: list[int] = []
+    of_group: list[int] = []
+    name = group = 0
     for number, line in _lines(path):
         words = line.split()
-        if not words:
-            continue
         try:
             if words[0] == "v":
                 position = [float(word) for word in words[1:4]]
@@ -52,42 +122,52 @@ def read_polygons(path: Path) -> tuple[np.ndarray, list[list[int]]]:
                     raise ValueError("a vertex needs three numbers")
                 vertices.append(position)
             elif words[0] == "f":
-                polygons.append(_corners(words[1:], len(vertices)))
+                corners += _corners(words[1:], len(vertices))
+                counts.append(len(words) - 1)
+                of_object.append(name)
+                of_group.append(group)
+            elif words[0] == "o":
+                name = objects.setdefault(" ".join(words[1:]), len(objects))
+            elif words[0] == "g":
+                group = groups.setdefault(" ".join(words[1:]), len(groups))
         except ValueError as error:
             raise MeshError(f"{path}, line {number}: {error}. The file is damaged or cut short.") from None
-    if not vertices or not polygons:
+    if not vertices or not counts:
+        raise MeshError(f"{path}: {len(vertices):,} vertices and {len(counts):,} faces; is this an OBJ file of a mesh?")
+    indices = np.array(corners, dtype=np.int64)
+    beyond = np.add.reduceat(indices >= len(vertices), np.cumsum(counts) - counts) > 0
+    if beyond.any():
         raise MeshError(
-            f"{path}: {len(vertices):,} vertices and {len(polygons):,} faces; is this an OBJ file of a mesh?"
+            f"{path}: {beyond.sum():,} of {len(counts):,} faces name vertices beyond the {len(vertices):,} of the "
+            f"file (first: vertex {indices[indices >= len(vertices)][0] + 1}). The file is damaged or cut short."
         )
-    positions = np.array(vertices, dtype=np.float64)
-    beyond = [p for p in polygons if max(p) >= len(vertices)]
-    if beyond:
-        raise MeshError(
-            f"{path}: {len(beyond):,} of {len(polygons):,} faces name vertices beyond the {len(vertices):,} of the "
-            f"file (first: vertex {max(beyond[0]) + 1}). The file is damaged or cut short."
-        )
-    return positions, polygons
+    named_objects = Parts(list(objects), np.array(of_object))
+    named_groups = Parts(list(groups), np.array(of_group), several=True)
+    return ObjMesh(np.array(vertices, dtype=np.float64), np.array(counts), indices, named_objects, named_groups)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without comments, continued ones joined."""
+    """Numbered lines that say something, without comments; lines of numbers with those that continue them."""
     try:
-        text = path.read_text(encoding="utf-8", errors="surrogateescape")
+        data = path.read_bytes()
     except IsADirectoryError:
         raise MeshError(f"{path} is a folder, not an OBJ file.") from None
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = data.decode("utf-16" if wide else "utf-8-sig", errors="replace" if wide else "surrogateescape")
     if "\0" in text[:4096]:
         raise MeshError(f"{path}: binary data; this is not an OBJ file.")
-    pending = ""
-    start: int | None = None
+    pending, start = "", 0
     for number, line in enumerate(text.splitlines(), 1):
-        line = line.split("#", 1)[0]
-        start = start or number
-        if line.rstrip().endswith("\\"):
-            pending += line.rstrip()[:-1] + " "
+        line = line.split("#", 1)[0].strip()
+        line = f"{pending} {line}" if pending else line
+        start = start if pending else number
+        if line.endswith("\\") and line.split(None, 1)[0] in CONTINUED:
+            pending = line[:-1].rstrip()
             continue
-        yield start, pending + line
-        pending, start = "", None
-    if pending and start is not None:
+        pending = ""
+        if line:
+            yield start, line
+    if pending:
         yield start, pending
 
 
@@ -98,8 +178,8 @@ def _corners(words: list[str], count: int) -> list[int]:
     for word in words:
         index = int(word.split("/", 1)[0])
         index = index - 1 if index > 0 else count + index if index < 0 else -1
-        if index < 0:
-            raise ValueError(f"corner {word!r} names a vertex before the first")
+        if not 0 <= index < 2**31:
+            raise ValueError(f"corner {word!r} names a vertex before the first or beyond any last")
         corners.append(index)
     return corners
 
@@ -113,7 +193,7 @@ def obj_text(vertices: np.ndarray, faces: np.ndarray, name: str = "") -> str:
 
 
 def _read(path: Path, options: ReadOptions) -> MeshData:
-    return MeshData(*read_obj(path))
+    return MeshData(*read_obj(path, options.mesh))
 
 
 def _write(path: Path, data: MeshData) -> None:
@@ -121,4 +201,4 @@ def _write(path: Path, data: MeshData) -> None:
         temporary.write_text(obj_text(data.vertices, data.faces, data.name), encoding="utf-8")
 
 
-FORMAT = Format(read_mesh=_read, write_mesh=_write)
+FORMAT = Format(read_mesh=_read, write_mesh=_write, named=True)

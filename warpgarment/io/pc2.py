@@ -7,7 +7,9 @@ samples
 from __future__ import annotations
 
 import struct
+import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,23 +17,34 @@ from warpgarment.errors import MeshError
 
 from .atomic import atomic_files
 from .data import Format, MotionData, ReadOptions
-from .obj import obj_text, read_obj
+from .obj import chosen_polygons, obj_text, read_polygons
+from .parts import unnamed
 from .ply import read_ply
+from .polygons import triangulate_counts
 
 HEADER = struct.Struct("<12siiffi")
 SIGNATURE = b"POINTCACHE2\0"
+FAR = 2.0  # how much an edge is stretched, beyond which it is another one
 
 
-def read_pc2(path: Path) -> np.ndarray:
-    """Positions of a PC2 file in its unit, float32, shape [T,V,3].
+class PointCache(NamedTuple):
+    """Positions [T,V,3], float32 in the file's unit; frame of the first sample, and frames from one to the next."""
+
+    vertices: np.ndarray
+    start: float
+    sampling: float
+
+
+def read_pc2(path: Path) -> PointCache:
+    """A PC2 file.
 
     Raises:
-        MeshError: Another signature or version, or fewer bytes than the header says.
+        MeshError: Another signature or version, fewer bytes than the header says, or a sampling that is not positive.
     """
     data = Path(path).read_bytes()
     if len(data) < HEADER.size or not data.startswith(SIGNATURE[:11]):
         raise MeshError(f"{path}: does not start with POINTCACHE2; this is not a PC2 file, or it is cut short.")
-    _, version, points, _, _, samples = HEADER.unpack_from(data)
+    _, version, points, start, sampling, samples = HEADER.unpack_from(data)
     if version != 1 or points < 1 or samples < 1:
         raise MeshError(
             f"{path}: version {version} with {points:,} points and {samples:,} samples; only version 1 is known."
@@ -42,7 +55,12 @@ def read_pc2(path: Path) -> np.ndarray:
             f"{path}: {len(data):,} bytes where {samples:,} samples of {points:,} points need {size:,}. "
             "The file is damaged or cut short."
         )
-    return np.frombuffer(data, dtype="<f4", offset=HEADER.size).reshape(samples, points, 3).astype(np.float32)
+    if not (np.isfinite(start) and 1e-3 <= sampling <= 1e3):
+        raise MeshError(
+            f"{path}: the header says that samples are {sampling:g} frames apart, from frame {start:g}. Write it again."
+        )
+    vertices = np.frombuffer(data, dtype="<f4", offset=HEADER.size).reshape(samples, points, 3)
+    return PointCache(vertices.astype(np.float32), start, sampling)
 
 
 def write_pc2_to(path: Path, vertices: np.ndarray, *, start: float = 0.0, sampling: float = 1.0) -> None:
@@ -63,16 +81,49 @@ def write_pc2_to(path: Path, vertices: np.ndarray, *, start: float = 0.0, sampli
 
 def _read(path: Path, options: ReadOptions) -> MotionData:
     """The cache, with the faces of the mesh of the same name beside it."""
-    readers = {path.with_suffix(".obj"): read_obj, path.with_suffix(".ply"): read_ply}
-    mesh = next((candidate for candidate in readers if candidate.exists()), None)
+    beside = [path.with_suffix(suffix) for suffix in (".obj", ".OBJ", ".ply", ".PLY")]
+    mesh = next((candidate for candidate in beside if candidate.exists()), None)
     if mesh is None:
         raise MeshError(
             f"{path}: a point cache has no faces; put {path.stem}.obj, with the same vertex order, beside it."
         )
-    vertices, (rest, faces) = read_pc2(path), readers[mesh](mesh)
-    if len(rest) != vertices.shape[1]:
-        raise MeshError(f"{path} has {vertices.shape[1]:,} points and {mesh.name} {len(rest):,} vertices.")
-    return MotionData(vertices, faces)
+    cache = read_pc2(path)
+    if mesh.suffix.lower() == ".ply":
+        unnamed(path, options.mesh)
+        rest, faces = read_ply(mesh)
+        count, used = len(rest), np.arange(len(rest))
+    else:
+        found = read_polygons(mesh)
+        used, rest, counts, corners = chosen_polygons(mesh, found, options.mesh)
+        count, faces = len(found.vertices), triangulate_counts(rest, counts, corners)
+    if count != cache.vertices.shape[1]:
+        raise MeshError(f"{path} has {cache.vertices.shape[1]:,} points and {mesh.name} {count:,} vertices.")
+    vertices = cache.vertices[:, used]
+    _warn_about_order(path, mesh, rest, vertices[0], faces)
+    return MotionData(vertices, faces, step=cache.sampling, start=cache.start / cache.sampling)
+
+
+def _warn_about_order(path: Path, mesh: Path, rest: np.ndarray, first: np.ndarray, faces: np.ndarray) -> None:
+    """Warns where the edges of the first frame are far from those of the mesh, as they are in another order.
+
+    What the two have in common is looked for in the ratios of lengths: cloth and skin stretch by some per cent, and a
+    unit changes all of them alike.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    before, after = (np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (rest.astype(float), first))
+    real = (before > 0) & np.isfinite(after)
+    if not real.any():
+        return
+    ratio = after[real] / before[real]
+    middle = float(np.median(ratio))
+    odd = (ratio > FAR * middle) | (ratio < middle / FAR)
+    if middle == 0 or odd.mean() > 0.2:
+        warnings.warn(
+            f"{path}: {np.count_nonzero(odd):,} of {len(ratio):,} edges have another length in the first frame than in "
+            f"{mesh.name}, by more than a factor of {FAR:g}: its vertices seem to be in another order.",
+            UserWarning,
+            stacklevel=6,
+        )
 
 
 def _write(path: Path, data: MotionData) -> None:
@@ -82,4 +133,4 @@ def _write(path: Path, data: MotionData) -> None:
         write_pc2_to(cache, data.vertices)
 
 
-FORMAT = Format(read_motion=_read, write_motion=_write)
+FORMAT = Format(read_motion=_read, write_motion=_write, named=True)

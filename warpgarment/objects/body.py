@@ -83,6 +83,7 @@ class BodyMotion:
         fps: float | None = None,
         collider: bool = True,
         mesh: str | None = None,
+        up: str | None = None,
     ) -> BodyMotion:
         """Reads a motion.
 
@@ -91,27 +92,31 @@ class BodyMotion:
           parts such as hands are no colliders, `collider_faces` (bool, [F]);
         - ``.pc2`` with a mesh of the same name beside it (``.obj``, else ``.ply``);
         - ``.usd``, ``.usda``, ``.usdc``, ``.usdz``: a mesh with time samples;
-        - a folder of ``.obj`` files with the same faces, in the order of the numbers in their names;
+        - a folder of ``.obj`` files with the same faces, at the numbers in their names;
         - any mesh file that `Garment.load` reads, as a single frame.
 
         Args:
             path: File or folder.
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that
                 USD files are converted by their own `metersPerUnit` and `upAxis`.
-            fps: Frames per second, in place of the file's; None takes the file's rate, or 30 if it has none.
+            fps: Frames per second, in place of the file's rate. None takes that, or 30, with a warning, if it has none.
+                For a point cache with a sample every n frames, or a folder with a file every n frames, these frames
+                are meant.
             collider: Whether only the file's `collider_faces` are kept, if it has any.
-            mesh: Name of the mesh to read, if a USD file holds several.
+            mesh: Name of the mesh to read where a file holds several: a prim of USD, an object or group of OBJ, a node
+                or mesh of glTF. "*" reads everything in OBJ and glTF as one.
+            up: Axis that points up in the file, "y" or "z". None is Y, except that USD files say it themselves.
 
         Raises:
             MeshError: The file is not of its kind or truncated, its arrays do not fit each other, or the constructor
                 refuses them.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.files import read_motion
+        from warpgarment.io.files import rate_of, read_motion
 
         path = Path(path)
-        data = read_motion(path, unit=unit, mesh=mesh)
-        rate = fps if fps is not None else data.fps if data.fps is not None else 30.0
+        data = read_motion(path, unit=unit, mesh=mesh, up=up)
+        rate = rate_of(path, data, fps)
         try:
             motion = cls(data.vertices, data.faces, rate)
             return motion.submesh(data.collider_faces) if collider and data.collider_faces is not None else motion

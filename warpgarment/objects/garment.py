@@ -68,20 +68,28 @@ class Garment:
 
     @classmethod
     def load(
-        cls, path: str | os.PathLike, unit: str | None = None, *, clean: bool = False, mesh: str | None = None
+        cls,
+        path: str | os.PathLike,
+        unit: str | None = None,
+        *,
+        clean: bool = False,
+        mesh: str | None = None,
+        up: str | None = None,
     ) -> Garment:
-        """Reads a garment from .obj, .ply, .stl, .glb, .gltf, .npz or .usd (.usda, .usdc, .usdz).
+        """Reads a garment from .obj, .ply, .off, .stl, .glb, .gltf, .npz or .usd (.usda, .usdc, .usdz).
 
-        Polygons become triangles. Vertices are never split at texture seams or normals: those of .obj, .ply, .npz
-        and .usd files come in the file's number and order. Formats that repeat vertices for every face (.stl) or seam
-        (.glb, .gltf) have vertices at exactly the same place joined again.
+        Polygons become triangles. Vertices are never split at texture seams or normals: those of .obj, .ply, .off,
+        .npz and .usd files come in the file's number and order. Formats that repeat vertices for every face (.stl) or
+        seam (.glb, .gltf) have vertices at exactly the same place joined again.
 
         Args:
             path: File to read.
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that
                 USD files are converted by their own `metersPerUnit` and `upAxis`.
             clean: Whether a mesh that the constructor would refuse is repaired as by `cleaned_from`.
-            mesh: Name of the mesh to read, if a USD file holds several.
+            mesh: Name of the mesh to read where a file holds several: a prim of USD, an object or group of OBJ, a node
+                or mesh of glTF. "*" reads everything in OBJ and glTF as one.
+            up: Axis that points up in the file, "y" or "z". None is Y, except that USD files say it themselves.
 
         Raises:
             MeshError: The file is not of its kind, is truncated, or holds a mesh that the constructor refuses.
@@ -93,7 +101,7 @@ class Garment:
         from warpgarment.io.files import read_mesh
 
         path = Path(path)
-        data = read_mesh(path, unit=unit, mesh=mesh)
+        data = read_mesh(path, unit=unit, mesh=mesh, up=up)
         try:
             make = cls.cleaned_from if clean else cls
             return make(data.vertices, data.faces, pins=data.pins, name=data.name or path.stem)

@@ -78,7 +78,13 @@ class GarmentMotion:
 
     @classmethod
     def load(
-        cls, path: str | os.PathLike, *, unit: str | None = None, fps: float | None = None, mesh: str | None = None
+        cls,
+        path: str | os.PathLike,
+        *,
+        unit: str | None = None,
+        fps: float | None = None,
+        mesh: str | None = None,
+        up: str | None = None,
     ) -> GarmentMotion:
         """Reads what `save` wrote, in any of its formats; only .npz keeps the statuses and the name.
 
@@ -86,20 +92,21 @@ class GarmentMotion:
             path: File or folder.
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that USD files
                 are converted by their own `metersPerUnit` and `upAxis`.
-            fps: Overrides the file's rate; 30 where neither says, as .pc2 and folders of .obj do not.
-            mesh: Name of the mesh to read where a USD file holds several.
+            fps: Overrides the file's rate; 30, with a warning, where neither says, as .pc2 and folders of .obj do not.
+            mesh: See `BodyMotion.load`.
+            up: See `BodyMotion.load`.
 
         Raises:
             MeshError: Not such a file.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.files import read_motion
+        from warpgarment.io.files import rate_of, read_motion
 
         path = Path(path)
-        data = read_motion(path, unit=unit, mesh=mesh)
+        data = read_motion(path, unit=unit, mesh=mesh, up=up)
         if path.suffix.lower() == ".npz" and data.fps is None and fps is None:
             raise MeshError(f"{path}: no array named 'fps'; it is not what GarmentMotion.save writes. Give fps=.")
-        rate = fps if fps is not None else data.fps if data.fps is not None else 30.0
+        rate = rate_of(path, data, fps)
         try:
             status: list[RolloutStatus] = []
             if "status_finite" in data.extra:

@@ -163,7 +163,7 @@ def test_blender_is_given_the_body_and_the_pins_in_the_right_frames(tmp_path):
     write_scene(tmp_path, scene, settings)
     numbers, _ = blender_numbers(scene, settings)
     assert numbers["first_frame"] == 4, "frame 1 is the start; two frames settle; the next is the first shown"
-    body, path = (to_y_up(read_pc2(tmp_path / name)) / settings.scale for name in ("body.pc2", "pins.pc2"))
+    body, path = (to_y_up(read_pc2(tmp_path / name).vertices) / settings.scale for name in ("body.pc2", "pins.pc2"))
     assert len(body) == len(path) == numbers["last_frame"] == 7
     np.testing.assert_allclose(body[:4], np.repeat(frames[:1], 4, axis=0), atol=1e-6)
     np.testing.assert_allclose(body[3:], frames, atol=1e-6)

@@ -13,7 +13,7 @@ __all__ = ["FORMAT", "UsdMesh", "read_usd", "write_usd"]
 
 
 def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
-    found = read_usd(path, mesh=options.mesh, frames=False, convert=options.unit is None)
+    found = read_usd(path, mesh=options.mesh, frames=False, convert=options.unit is None, turn=options.up is None)
     return MeshData(found.vertices[0], found.faces)
 
 
@@ -22,12 +22,12 @@ def _write_mesh(path: Path, data: MeshData) -> None:
 
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
-    found = read_usd(path, mesh=options.mesh, convert=options.unit is None)
-    return MotionData(found.vertices, found.faces, found.fps, name=found.name)
+    found = read_usd(path, mesh=options.mesh, convert=options.unit is None, turn=options.up is None)
+    return MotionData(found.vertices, found.faces, found.fps, name=found.name, start=found.start)
 
 
 def _write_motion(path: Path, data: MotionData) -> None:
     write_usd(path, [(data.name or "mesh", data.vertices, data.faces)], 30.0 if data.fps is None else data.fps)
 
 
-FORMAT = Format("usd", _read_mesh, _write_mesh, _read_motion, _write_motion, only_read=(".usdz",))
+FORMAT = Format("usd", _read_mesh, _write_mesh, _read_motion, _write_motion, only_read=(".usdz",), named=True)

@@ -9,12 +9,12 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.polygons import triangulate_counts
+from warpgarment.io.times import Frames, frames_of
 
 from .skeleton import Skinning, skinning_of
-from .times import Frames, frames_of
 from .writing import pxr
 
-LARGEST = 4 << 30  # bytes of positions beyond which a file must have as many samples
+LARGEST = 512 << 20  # bytes of positions beyond which there must be a sample for every other frame
 
 
 class UsdMesh(NamedTuple):
@@ -27,7 +27,9 @@ class UsdMesh(NamedTuple):
     start: float = 0.0  # time of the first frame in frames: its time code, where the stage counts frames
 
 
-def read_usd(path: Path, *, mesh: str | None = None, frames: bool = True, convert: bool = True) -> UsdMesh:
+def read_usd(
+    path: Path, *, mesh: str | None = None, frames: bool = True, convert: bool = True, turn: bool = True
+) -> UsdMesh:
     """Reads one mesh of a stage, in world space, Y up, polygons as triangles that look outwards as USD defines it.
 
     Instances are looked into. A mesh that no renderer shows (invisible, or of another purpose than default and render)
@@ -38,6 +40,7 @@ def read_usd(path: Path, *, mesh: str | None = None, frames: bool = True, conver
         mesh: Name or path of the prim; may be left out where the stage shows a single mesh.
         frames: All frames, as `times.frames_of` has them, or the first only.
         convert: Scale by the stage's metersPerUnit.
+        turn: Turn a stage whose upAxis is Z.
 
     Raises:
         MeshError: Not a stage, no mesh, several and none named, attributes of other types or sizes, or topology that
@@ -79,7 +82,7 @@ def read_usd(path: Path, *, mesh: str | None = None, frames: bool = True, conver
     left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
     if left != (_determinant(prim, skinning, times[0], UsdGeom) < 0):
         faces = faces[:, ::-1].copy()
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
+    if turn and UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
         vertices = np.stack([vertices[..., 0], vertices[..., 2], -vertices[..., 1]], axis=-1)
     if convert:
         vertices = vertices * UsdGeom.GetStageMetersPerUnit(stage)

@@ -1,0 +1,172 @@
+"""Meshes of a glTF scene over time: below moving nodes, morphed, and skinned by joints."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from .animation import Channels, local_matrices
+from .container import Document
+
+TRIANGLES, STRIP, FAN = 4, 5, 6
+
+
+class Placed(NamedTuple):
+    """One mesh of the scene: name of its node, else its mesh; name of its mesh; positions [T,V,3], faces [F,3]."""
+
+    name: str
+    mesh: str
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+class Scene:
+    """The nodes of a document's scene.
+
+    Args:
+        document: The file.
+        channels: Its animation.
+        times: When positions are wanted [s], shape [T].
+    """
+
+    def __init__(self, document: Document, channels: Channels, times: np.ndarray):
+        self._document, self._channels, self._times = document, channels, times
+        self._parents: dict[int, int] = {}
+        nodes = document.json.get("nodes", [])
+        for number in range(len(nodes)):
+            for child in document.item("nodes", number).get("children", []):
+                document.item("nodes", child)
+                if child in self._parents:
+                    raise ValueError(f"node {child} has two parents")
+                self._parents[child] = number
+        scenes = document.json.get("scenes")
+        roots = set(document.item("scenes", document.json.get("scene", 0)).get("nodes", [])) if scenes else None
+        self._world: dict[int, np.ndarray] = {}
+        self.meshes = []
+        for number, node in enumerate(nodes):
+            if "mesh" in node and (roots is None or self._chain(number)[-1] in roots):
+                self.meshes.append(number)
+
+    def _chain(self, number: int) -> list[int]:
+        """A node, its parent, and so on."""
+        chain = [number]
+        while chain[-1] in self._parents:
+            chain.append(self._parents[chain[-1]])
+            if len(chain) > len(self._document.json["nodes"]):
+                raise ValueError(f"node {number} is its own ancestor")
+        return chain
+
+    def _matrices(self, number: int) -> np.ndarray:
+        """Transforms of a node in the world [T,4,4], or [1,4,4] where it does not move."""
+        for at in reversed(self._chain(number)):
+            if at not in self._world:
+                local = local_matrices(self._document.item("nodes", at), at, self._channels, self._times)
+                parent = self._parents.get(at)
+                self._world[at] = local if parent is None else self._world[parent] @ local
+        return self._world[number]
+
+    def size(self, number: int) -> int:
+        """Vertices of the mesh of a node."""
+        mesh = self._document.item("meshes", self._document.item("nodes", number)["mesh"])
+        return sum(len(self._document.array(p["attributes"]["POSITION"])) for p in mesh["primitives"])
+
+    def placed(self, number: int) -> Placed:
+        """The mesh of a node, all its primitives."""
+        node = self._document.item("nodes", number)
+        mesh = self._document.item("meshes", node["mesh"])
+        vertices, faces, base = [], [], 0
+        for primitive in mesh["primitives"]:
+            mode = primitive.get("mode", TRIANGLES)
+            if mode not in (TRIANGLES, STRIP, FAN):
+                continue  # points and lines
+            positions = self._positions(node, number, mesh, primitive)
+            corners = self._faces(primitive, mode, positions.shape[1])
+            mirrored = np.linalg.det(self._matrices(number)[0, :3, :3]) < 0 and "skin" not in node
+            faces.append((corners[:, ::-1] if mirrored else corners) + base)
+            vertices.append(positions)
+            base += positions.shape[1]
+        count = max((len(v) for v in vertices), default=1)
+        together = [np.broadcast_to(v, (count, *v.shape[1:])) for v in vertices]
+        name = str(mesh.get("name", ""))
+        return Placed(
+            str(node.get("name", "")) or name or f"node {number}",
+            name,
+            np.concatenate(together, axis=1) if together else np.zeros((1, 0, 3)),
+            np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64),
+        )
+
+    def _positions(
+        self, node: dict[str, Any], number: int, mesh: dict[str, Any], primitive: dict[str, Any]
+    ) -> np.ndarray:
+        """Positions in the world, [T,V,3], or [1,V,3] where nothing moves."""
+        attributes = primitive["attributes"]
+        points = _points(self._document.array(attributes["POSITION"]))[None]
+        targets = [t["POSITION"] for t in primitive.get("targets", []) if "POSITION" in t]
+        if targets:
+            every = [k for k, t in enumerate(primitive["targets"]) if "POSITION" in t]
+            weights = self._channels.values(number, "weights", self._times)
+            if weights is None:
+                still = node.get("weights", mesh.get("weights", [0.0] * len(primitive["targets"])))
+                weights = np.array(still, dtype=np.float64)[None]
+            for k, target in zip(every, targets, strict=True):
+                points = points + weights[:, k, None, None] * _points(self._document.array(target), points.shape[1])
+        if "skin" in node:
+            return self._skinned(points, self._document.item("skins", node["skin"]), attributes)
+        matrices = self._matrices(number)
+        return points @ matrices[:, :3, :3].transpose(0, 2, 1) + matrices[:, None, :3, 3]
+
+    def _skinned(self, points: np.ndarray, skin: dict[str, Any], attributes: dict[str, Any]) -> np.ndarray:
+        """Positions that joints move; glTF leaves the transform of the mesh's own node out."""
+        count, joints = points.shape[1], skin["joints"]
+        bind = np.tile(np.eye(4), (len(joints), 1, 1))
+        if "inverseBindMatrices" in skin:
+            bind = self._document.array(skin["inverseBindMatrices"]).astype(np.float64)
+            bind = bind.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(joints)]
+        world = [self._matrices(self._checked(joint)) @ matrix for joint, matrix in zip(joints, bind, strict=True)]
+        sets = [k for k in range(8) if f"JOINTS_{k}" in attributes]
+        index = np.concatenate([self._document.array(attributes[f"JOINTS_{k}"]) for k in sets], axis=1).astype(int)
+        weight = np.concatenate([self._document.array(attributes[f"WEIGHTS_{k}"]) for k in sets], axis=1).astype(float)
+        if index.shape != weight.shape or len(index) != count or index.max() >= len(joints):
+            raise ValueError("joints and weights of a skin do not fit its mesh")
+        total = weight.sum(axis=1, keepdims=True)
+        weight = np.where(total > 0, weight / np.where(total > 0, total, 1.0), 0.0)
+        rows = np.repeat(np.arange(count), index.shape[1])
+        blend = csr_matrix((weight.reshape(-1), (rows, index.reshape(-1))), shape=(count, len(joints)))
+        frames = max(len(points), *(len(m) for m in world))
+        moved = np.empty((frames, count, 3))
+        for t in range(frames):
+            transforms = np.stack([m[min(t, len(m) - 1)] for m in world])[:, :3].reshape(len(joints), 12)
+            each = (blend @ transforms).reshape(count, 3, 4)
+            moved[t] = np.einsum("vij,vj->vi", each[:, :, :3], points[min(t, len(points) - 1)]) + each[:, :, 3]
+        return moved
+
+    def _checked(self, joint: Any) -> int:
+        self._document.item("nodes", joint)
+        return int(joint)
+
+    def _faces(self, primitive: dict[str, Any], mode: int, count: int) -> np.ndarray:
+        if "indices" in primitive:
+            corners = self._document.array(primitive["indices"])
+            if corners.ndim != 1 or corners.dtype.kind != "u":
+                raise ValueError("indices that are no whole numbers")
+            corners = corners.astype(np.int64)
+        else:
+            corners = np.arange(count)
+        if len(corners) and corners.max() >= count:
+            raise ValueError(f"a face names vertex {int(corners.max()):,}, and there are {count:,}")
+        if mode == TRIANGLES:
+            if len(corners) % 3:
+                raise ValueError(f"{len(corners):,} corners are no triangles")
+            return corners.reshape(-1, 3)
+        k = np.arange(max(len(corners) - 2, 0))
+        if mode == FAN:
+            return np.stack([corners[k + 1], corners[k + 2], corners[0 * k]], axis=1)
+        return np.stack([corners[k], corners[k + 1 + k % 2], corners[k + 2 - k % 2]], axis=1)
+
+
+def _points(array: np.ndarray, count: int | None = None) -> np.ndarray:
+    if array.ndim != 2 or array.shape[1] != 3 or (count is not None and len(array) != count):
+        raise ValueError(f"positions of shape {list(array.shape)}")
+    return array.astype(np.float64)
