@@ -135,7 +135,8 @@ def read_polygons(path: Path) -> ObjMesh:
     if not vertices or not counts:
         raise MeshError(f"{path}: {len(vertices):,} vertices and {len(counts):,} faces; is this an OBJ file of a mesh?")
     indices = np.array(corners, dtype=np.int64)
-    beyond = np.add.reduceat(indices >= len(vertices), np.cumsum(counts) - counts) > 0
+    starts = (np.cumsum(counts) - counts).astype(np.int64)
+    beyond = np.add.reduceat(indices >= len(vertices), starts) > 0
     if beyond.any():
         raise MeshError(
             f"{path}: {beyond.sum():,} of {len(counts):,} faces name vertices beyond the {len(vertices):,} of the "
