@@ -27,6 +27,9 @@ FLAT = 1e-3
 ROUNDING = 1e-7
 """The same for a closed piece, whose volume is exact but for rounding."""
 
+MOST_MENDED = 0.1
+"""Largest share of a garment's faces that are turned round to agree with the others."""
+
 
 class Outward(NamedTuple):
     """Faces that look outwards, and what had to be done for it."""
@@ -88,6 +91,41 @@ def turned_outward(vertices: np.ndarray, faces: np.ndarray, what: str) -> np.nda
     if message:
         warnings.warn(message, UserWarning, stacklevel=3)
     return result.faces
+
+
+def agreeing(vertices: np.ndarray, faces: np.ndarray, what: str) -> np.ndarray:
+    """Turns a few faces of a garment round that disagree with their neighbours about the outside.
+
+    A garment is open, so the side of most of a piece's area is the outside. Where more than `MOST_MENDED` of all faces
+    would have to be turned, that is a guess, and the faces are returned as they are.
+
+    Args:
+        vertices: Positions [m], shape [V,3].
+        faces: Vertex indices, int32 [F,3].
+        what: What the warning calls the mesh.
+
+    Returns:
+        Faces, int32 [F,3], in the given order.
+    """
+    oriented, piece = igl.bfs_orient(np.ascontiguousarray(faces, np.int64))
+    piece = np.asarray(piece).reshape(-1)
+    turned = _reversed(faces, oriented)
+    area = _areas(vertices, faces)
+    most = np.bincount(piece, area * turned) > 0.5 * np.bincount(piece, area)
+    turned ^= most[piece]
+    count = int(np.count_nonzero(turned))
+    if not count or count > MOST_MENDED * len(faces):
+        return faces
+    result = np.where(turned[:, None], faces[:, ::-1], faces).astype(np.int32)
+    if _torn(result):
+        return faces
+    warnings.warn(
+        f"{count:,} of {len(faces):,} faces of {what} disagreed with their neighbours about the outside (first: face "
+        f"{int(np.argmax(turned))}) and were turned round. Reverse them in the file.",
+        UserWarning,
+        stacklevel=3,
+    )
+    return result
 
 
 def _reversed(faces: np.ndarray, oriented: np.ndarray) -> np.ndarray:

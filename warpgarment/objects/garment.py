@@ -20,6 +20,7 @@ from warpgarment.geometry.checks import (
     directed_edges,
 )
 from warpgarment.geometry.clean import clean_mesh
+from warpgarment.geometry.orientation import agreeing
 from warpgarment.io.cache import remembered
 
 if TYPE_CHECKING:
@@ -51,13 +52,14 @@ class Garment:
     Raises:
         MeshError: The arrays have other shapes or are empty, or there are numbers that are not finite, indices out of
             range, faces with a vertex twice or without area (relative to the mesh's size), faces given twice, edges of
-            more than two faces, neighbours that disagree on the outside, or vertices without a face. The error names
-            the element, the count and the remedy.
+            more than two faces, many neighbours that disagree on the outside (a few faces are turned round, with a
+            warning), or vertices without a face. The error names the element, the count and the remedy.
     """
 
     def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = ""):
         self.vertices = checked_positions(vertices)
         self.faces = checked_faces(faces, len(self.vertices), remedy=REMEDY)
+        self.faces = agreeing(self.vertices, self.faces, f"garment {name!r}" if name else "the garment")
         check_rest_mesh(self.vertices, self.faces)
         self.pins = checked_pins(pins, len(self.vertices))
         self.name = str(name)
