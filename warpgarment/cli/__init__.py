@@ -6,13 +6,16 @@ verb is called, so help is quick and training's dependencies are asked for by tr
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import re
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from warpgarment.errors import UsageError
+from warpgarment.errors import MeshError, UsageError
 
 _ROOM = "warpgarment"
 _EXTRAS = {
@@ -126,6 +129,36 @@ def check_output(path: Path, suffixes: Sequence[str]) -> None:
     if path.suffix.lower() not in suffixes:
         allowed = ", ".join(s or "a folder (no suffix)" for s in suffixes)
         raise UsageError(f"cannot write {path.name!r}. Formats: {allowed}.")
+
+
+@contextlib.contextmanager
+def spoken(**options: str) -> Iterator[None]:
+    """Lets errors and warnings about files name options of the command line instead of Python's arguments.
+
+    Warnings are printed, each as a line.
+
+    Args:
+        options: The option for each argument, such as ``mesh="--body-mesh"``.
+    """
+
+    from warpgarment.geometry.checks import REMEDY
+
+    argument = re.compile(rf'(?<![\w-])({"|".join(options)})=(?:"([^"]*)"|True\b)?')
+
+    def translated(text: str) -> str:
+        if "clean" in options:
+            text = text.replace(REMEDY, f"Use {options['clean']}, or remove them.")
+        return argument.sub(lambda found: f"{options[found[1]]} {found[2] or ''}".rstrip(), text)
+
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            yield
+        except MeshError as error:
+            raise MeshError(translated(str(error))) from error
+        finally:
+            for warning in dict.fromkeys(translated(str(w.message)) for w in heard):
+                print(f"warpgarment: {' '.join(warning.split())}", file=sys.stderr)
 
 
 def _options(verb: Verb, name: str, arguments: Sequence[str]) -> object:

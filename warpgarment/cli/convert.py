@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 
-from . import check_output
+from . import check_output, spoken
 
 
 @dataclass
@@ -23,16 +24,28 @@ class Convert:
     """Motion to write: .npz, .usd (.usda, .usdc), .pc2, or a folder of .obj."""
     fps: float | None = None
     """Resample to this rate; by default the rate stays."""
+    input_fps: float | None = None
+    """Rate of the input, where its file does not say (.pc2, folders of .obj) or says something else."""
     unit: str | None = None
     """Length unit of the input where it is not metres: m, dm, cm, mm or in."""
+    up: Literal["y", "z"] | None = None
+    """Axis that points up in the input; by default Y, or what its file says."""
     mesh: str | None = None
-    """Name of the mesh to read where a USD file holds several."""
+    """Name of the mesh to read where the input holds several."""
 
 
 def run(options: Convert) -> None:
     """Reads, resamples if asked, writes."""
     check_output(options.output, suffixes("write_motion"))
-    motion = BodyMotion.load(options.input, unit=options.unit, mesh=options.mesh, collider=False)
+    with spoken(mesh="--mesh", unit="--unit", fps="--input-fps", up="--up"):
+        motion = BodyMotion.load(
+            options.input,
+            unit=options.unit,
+            fps=options.input_fps,
+            up=options.up,
+            mesh=options.mesh,
+            collider=False,
+        )
     if options.fps is not None:
         motion = motion.resampled(options.fps)
     motion.save(options.output)

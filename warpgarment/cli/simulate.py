@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import tyro
 
@@ -13,7 +14,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.view.report import rollout_table
 
-from . import check_output
+from . import check_output, spoken
 
 
 @dataclass
@@ -34,8 +35,18 @@ class Simulate:
     """Length unit of the garment's file where it is not metres: m, dm, cm, mm or in."""
     body_unit: str | None = None
     """The same for the body's."""
+    up: Literal["y", "z"] | None = None
+    """Axis that points up in the garment's file; by default Y, or what the file says."""
+    body_up: Literal["y", "z"] | None = None
+    """The same for the body's; by default that of the garment's."""
+    body_fps: float | None = None
+    """Rate of the body's motion, where its file does not say (.pc2, folders of .obj) or says something else."""
+    garment_mesh: str | None = None
+    """Name of the mesh where the garment's file holds several."""
     body_mesh: str | None = None
-    """Name of the mesh where the body's USD file holds several."""
+    """Name of the mesh where the body's file holds several."""
+    clean: bool = False
+    """Repair the garment's mesh: join vertices at the same place, turn faces that disagree, drop broken ones."""
     fit_rest: Path | None = None
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
     frames: int | None = None
@@ -47,19 +58,34 @@ def run(options: Simulate) -> None:
     check_output(options.out, suffixes("write_motion"))
     from warpgarment.sim.simulator import Simulator
 
-    garment = Garment.load(options.garment, unit=options.unit)
-    body = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh)
+    with spoken(mesh="--garment-mesh", unit="--unit", up="--up", clean="--clean"):
+        garment = Garment.load(
+            options.garment, unit=options.unit, up=options.up, mesh=options.garment_mesh, clean=options.clean
+        )
+    body = _body(options.body, options)
     simulator = Simulator.from_pretrained(options.weights, device=options.device)
     simulator.timings.synchronise = True
     first = None
     if options.fit_rest is not None:
         from warpgarment.objects.fit import fit
 
-        whole = BodyMotion.load(options.body, unit=options.body_unit, mesh=options.body_mesh, collider=False)
-        rest = BodyMotion.load(options.fit_rest, unit=options.body_unit, collider=False)
+        whole = _body(options.body, options, collider=False)
+        rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
     motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, progress=sys.stderr.isatty())
     motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))
     print(f"\nwrote {options.out}")
+
+
+def _body(path: Path, options: Simulate, **more: Any) -> BodyMotion:
+    """A motion in the body's unit, axis and rate."""
+    told = {
+        "unit": options.body_unit,
+        "up": options.body_up or options.up,
+        "fps": options.body_fps,
+        "mesh": options.body_mesh,
+    }
+    with spoken(mesh="--body-mesh", unit="--body-unit", up="--body-up", fps="--body-fps"):
+        return BodyMotion.load(path, **told | more)

@@ -12,7 +12,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.view import draw
 
-from . import check_output
+from . import check_output, spoken
 
 
 @dataclass
@@ -22,9 +22,15 @@ class View:
     motion: tyro.conf.Positional[tuple[Path, ...]]
     """Garment motions: .npz, .usd, .pc2 with its .obj beside it, or folders of .obj."""
     mesh: str | None = None
-    """Name of the mesh to read where a USD file holds several."""
+    """Name of the mesh to read where the motions' files hold several."""
+    fps: float | None = None
+    """Rate of the motions, where their files do not say (.pc2, folders of .obj) or say something else."""
     body: Path | None = None
     """Body motion to draw with them."""
+    body_mesh: str | None = None
+    """Name of the mesh where the body's file holds several."""
+    body_fps: float | None = None
+    """Rate of the body's motion, likewise."""
     out: Path | None = None
     """Draw to this file instead of a window: .mp4 the film, .png a sheet of moments."""
     frames: int = 8
@@ -41,11 +47,15 @@ def run(options: View) -> None:
         raise UsageError("view was given no motion. Name at least one file.")
     if options.out is not None:
         check_output(options.out, (".png", ".mp4"))
-    loaded = [BodyMotion.load(path, mesh=options.mesh, collider=False) for path in options.motion]
+    with spoken(mesh="--mesh", fps="--fps"):
+        loaded = [BodyMotion.load(path, mesh=options.mesh, fps=options.fps, collider=False) for path in options.motion]
     garments = [
         GarmentMotion(m.vertices, m.faces, m.fps, name=p.stem) for m, p in zip(loaded, options.motion, strict=True)
     ]
-    body = None if options.body is None else BodyMotion.load(options.body, collider=False)
+    body = None
+    if options.body is not None:
+        with spoken(mesh="--body-mesh", fps="--body-fps"):
+            body = BodyMotion.load(options.body, mesh=options.body_mesh, fps=options.body_fps, collider=False)
     if options.out is None:
         _window(body, garments)
         return

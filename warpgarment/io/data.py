@@ -84,6 +84,7 @@ class Format(NamedTuple):
         read_motion: Reads a mesh in motion.
         write_motion: Writes one.
         only_read: Suffixes of the format that are read and never written.
+        axis: Whether the files say which axis is up, or the format does.
         named: Whether meshes in a file have names; otherwise `ReadOptions.mesh` is refused before reading.
     """
 
@@ -94,6 +95,7 @@ class Format(NamedTuple):
     write_motion: Callable[[Path, MotionData], None] | None = None
     only_read: tuple[str, ...] = ()
     named: bool = False
+    axis: bool = False
 
 
 def scale_of(unit: str | None) -> float:

@@ -30,6 +30,8 @@ FORMATS: dict[tuple[str, ...], str] = {
 ASSUMED = 30.0  # frames a second where nobody says
 BIGGEST, SMALLEST = 10.0, 0.05  # sizes [m] beyond which a garment's unit is probably another
 
+LYING = 1.2, 2.4  # lengths along Z [m] of bodies that probably stand
+
 Ability = Literal["read_mesh", "write_mesh", "read_motion", "write_motion"]
 
 
@@ -109,7 +111,10 @@ def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None,
         assert format.read_mesh is not None
         single = format.read_mesh(path, options)
         data = MotionData(np.asarray(single.vertices)[None], single.faces, name=single.name)
-    return data._replace(vertices=_placed(data.vertices, scale, up))
+    data = data._replace(vertices=_placed(data.vertices, scale, up))
+    if up is None and not format.axis:
+        _warn_about_axis(path, np.asarray(data.vertices))
+    return data
 
 
 def rate_of(path: Path, data: MotionData, fps: float | None) -> float:
@@ -203,6 +208,20 @@ def _writer(path: Path, ability: Literal["write_mesh", "write_motion"]) -> Forma
     if suffix not in able or format is None:
         raise ValueError(f"cannot write {suffix or 'a file without a suffix'}; use {listed(able)}")
     return format
+
+
+def _warn_about_axis(path: Path, vertices: np.ndarray) -> None:
+    """Warns where the first frame is as long as people are tall, along Z, and lies flat."""
+    if vertices.ndim != 3 or vertices.shape[-1] != 3 or vertices.dtype.kind != "f" or not vertices.size:
+        return
+    _, y, z = np.ptp(vertices[0], axis=0).tolist()
+    if LYING[0] <= z <= LYING[1] and z > 2.5 * y:
+        warnings.warn(
+            f"{path}: {z:.2g} m along Z and {y:.2g} m along Y, which is taken for up: it lies on its back. If Z points "
+            'up in the file, say so with up="z".',
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def _warn_about_size(path: Path, vertices: np.ndarray, scale: float) -> None:

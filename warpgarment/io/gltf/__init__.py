@@ -107,4 +107,4 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     return read_gltf(path, mesh=options.mesh)[0]
 
 
-FORMAT = Format(read_mesh=_read_mesh, read_motion=_read_motion, named=True)
+FORMAT = Format(read_mesh=_read_mesh, read_motion=_read_motion, named=True, axis=True)

@@ -30,4 +30,6 @@ def _write_motion(path: Path, data: MotionData) -> None:
     write_usd(path, [(data.name or "mesh", data.vertices, data.faces)], 30.0 if data.fps is None else data.fps)
 
 
-FORMAT = Format("usd", _read_mesh, _write_mesh, _read_motion, _write_motion, only_read=(".usdz",), named=True)
+FORMAT = Format(
+    "usd", _read_mesh, _write_mesh, _read_motion, _write_motion, only_read=(".usdz",), named=True, axis=True
+)

@@ -186,7 +186,7 @@ def _array(
     listed = hasattr(value, "__len__") and not isinstance(value, str)
     array: np.ndarray = np.array(value) if listed else np.zeros(())
     right = array.dtype.kind in ("iu" if integers else "fiu") and array.ndim == (2 if columns else 1)
-    if array.size and not (right and (columns is None or array.shape[1] == columns)):
+    if array.size and not (right and (columns is None or array.shape[-1] == columns)):
         wanted = f"{'whole numbers' if integers else 'numbers'}{f' in rows of {columns}' if columns else ''}"
         raise MeshError(f"{where}: {name} holds {array.dtype} of shape {list(array.shape)} where a mesh has {wanted}.")
     return array.reshape((-1, columns) if columns else -1).astype(np.int64 if integers else np.float64)
