@@ -23,6 +23,7 @@ from warpgarment.io.atomic import atomic_file
 from warpgarment.nn.faces.network import build_network
 
 from . import hub, shards
+from .bounds import check_settings, checked_json
 from .config import NetworkConfig
 from .network import STATISTICS, GarmentNetwork
 
@@ -103,9 +104,11 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
     contents = shards.contents(path)
     path = contents.path
     config, _ = _described(contents)
-    network = build_network(config)
+    with torch.device("meta"):  # shapes alone: nothing is allocated for a config that the file does not bear out
+        network = build_network(config)
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     _check_tensors(path, expected, contents.shapes)
+    network = build_network(config)
     tensors = contents.tensors()
     for name, tensor in tensors.items():
         if tensor.dtype not in _DTYPES:
@@ -186,6 +189,7 @@ def _described(contents: shards.Contents) -> tuple[NetworkConfig, dict[str, obje
             f"{path}: format version {version or 'missing'}, this warpgarment reads {FORMAT_VERSION}; update it"
         )
     settings = _json_object(path, "config", metadata)
+    check_settings(path, settings, len(contents.shapes))
     return _config(path, settings), _json_object(path, "notes", metadata)
 
 
@@ -202,13 +206,9 @@ def _check_tensors(path: object, expected: Mapping[str, tuple], found: Mapping[s
 
 
 def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[str, Any]:
-    try:
-        value = json.loads(metadata[key])
-    except (KeyError, ValueError) as error:
-        raise CheckpointError(f"{path}: metadata {key!r} is missing or not JSON") from error
-    if not isinstance(value, dict):
-        raise CheckpointError(f"{path}: metadata {key!r} is not a JSON object")
-    return value
+    if key not in metadata:
+        raise CheckpointError(f"{path}: metadata {key!r} is missing or not JSON")
+    return checked_json(path, f"metadata {key!r}", metadata[key])
 
 
 def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:

@@ -200,7 +200,7 @@ def _read_index(folder: Path) -> tuple[dict[str, str], int]:
     path = folder / INDEX
     try:
         index: Any = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: is not JSON ({error}); {_AGAIN}") from error
     weight_map = index.get("weight_map") if isinstance(index, dict) else None
     about = index.get("metadata") if isinstance(index, dict) else None
