@@ -24,7 +24,7 @@ class Builder(Protocol[Built]):
     """What builds the batches of a loader: `SampleBuilder`, or `UnrolledBuilder` for several steps in a row."""
 
     device: torch.device
-    patches: bool
+    subsets: bool
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the recorded frames that a sample needs follow a frame."""
@@ -81,7 +81,7 @@ class Loader(Generic[Built]):
         pool: What the network's own rollouts did wrong, mixed in as `share` of the samples.
         share: Share of samples from the pool, where it has any that fit.
         splits: Number of subsets that a garment's faces are split into at a step; one of them is used. At 1, a
-            network of patches is shown whole garments, others as much of each as its batch's smallest has.
+            network without `subsets` is shown whole garments, others as much of each as its batch's smallest has.
         depth: Batches built ahead; 0 builds them when asked, without a thread.
         part: The samples of each batch that this process trains on.
     """
@@ -107,7 +107,7 @@ class Loader(Generic[Built]):
         picks = self.plan.picks(step)
         splits = self.splits(step) if splits is None else splits
         sizes = [int(self.plan.sizes[s]) for s, _ in picks]
-        whole = self.builder.patches and splits == 1
+        whole = not self.builder.subsets and splits == 1
         faces = max(sizes) if whole else max(min(sizes) // splits, 1)
         displacements: list[np.ndarray | None] = [None] * len(picks)
         fitting = self.pool.fitting(self.plan.sizes, faces, whole=whole)

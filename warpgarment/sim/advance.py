@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from warpgarment.nn.inputs import FrameInputs, VertexStep
+
 from .frame import Frame
 from .scene import Scene
 
@@ -13,9 +15,10 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     vertices = now.positions
     features = scene.features(vertices, now.body, next_body)
     stacked = now.history.stacked(features)
-    step = scene.predict(stacked, now.velocities)
+    step = scene.predict(FrameInputs(stacked, now.velocities, vertices, now.body, next_body))
     solved, finite = scene.reconstruct(vertices, step, features, next_body)
-    poisson = scene.poisson.summary()
+    # of positions that the network gave itself, no system was solved
+    poisson = now.solves.new_zeros(3) if isinstance(step, VertexStep) else scene.poisson.summary()
     origin = scene.carried(vertices, features) if scene.collision_passes else None
     committed, finite, depth, collision = scene.push_out(solved, next_body, finite & now.finite, origin)
     velocity = scene.components_mean(committed) - scene.components_mean(vertices)

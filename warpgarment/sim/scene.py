@@ -22,9 +22,9 @@ from warpgarment.kernels.features.face import frame_features
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.surface_depth import SurfaceDepth
+from warpgarment.nn.inputs import FrameInputs, VertexStep
 from warpgarment.nn.network import GarmentNetwork
-from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context
-from warpgarment.nn.rows import padded_views
+from warpgarment.nn.parametrisation import Step
 from warpgarment.objects.clearance import clearance
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies, PackedGarments
@@ -50,7 +50,7 @@ class Scene:
         body_vertices: Bodies in the first frame [m], packed, shape [U,3].
         first_vertices: Garments in the first frame [m], packed, shape [V,3].
         network: Reads its config; run by `predict`.
-        face_splits: As `padded_views`.
+        face_splits: As in `GarmentNetwork.layout`.
         epsilon: Distance that collision refinement keeps from the body [m]; None: see `clearance`.
         collision_passes: At most so many refinements a frame.
         half: Whether the transformer runs in bfloat16.
@@ -59,6 +59,7 @@ class Scene:
     Raises:
         MeshError: A garment is more than 1 m from its body.
         NotEnoughMemory: The batch would not fit on the device.
+        ValueError: The network reads what a simulation does not know yet.
     """
 
     def __init__(
@@ -75,6 +76,8 @@ class Scene:
         half: bool,
         timings: Timings,
     ) -> None:
+        if network.reads:
+            raise ValueError(f"the network reads {', '.join(sorted(network.reads))}, which simulations do not give yet")
         device = body_vertices.device
         self.garments, self.network, self.timings = list(garments), network, timings
         self.collision_passes, self.half = collision_passes, half
@@ -97,7 +100,7 @@ class Scene:
         self.refuse_far(first_vertices)
 
         self._face_of_vertex = face_at_each_vertex(packed.faces, vertex_count)
-        self.views = padded_views(packed, garments, network.config, face_splits)
+        self.layout = network.layout(garments, packed, face_splits=face_splits)
         pinned = len(packed.pins) > 0
         self.poisson = PoissonSolver(packed.rest_vertices, packed.faces, pins=packed.pins if pinned else None)
         self.collision = CollisionSolver(packed.rest_vertices, packed.faces)
@@ -154,34 +157,15 @@ class Scene:
                 next_body,
             )
 
-    def predict(self, stacked: torch.Tensor, velocities: torch.Tensor) -> Step:
-        """The network, step 2: stacked features [F,H,34] and velocities [C,H-1,3] -> what happens next."""
-        faces, components = len(stacked), len(velocities)
-        stacked, velocities = stacked.flatten(1), velocities.flatten(1)
-        output = NetworkOutput(
-            stacked.new_empty((faces, 3, 3)), stacked.new_empty((faces, 3)), stacked.new_zeros((components, 3))
-        )
-        training = self.network.training
-        self.network.eval()
-        device = stacked.device.type
-        with self.timings("network"), torch.autocast(device, torch.bfloat16, enabled=self.half):
-            for view in self.views:
-                rows = self.network(
-                    view.faces(stacked),
-                    view.components(velocities),
-                    view.weights,
-                    face_mask=view.face_mask,
-                    velocity_mask=view.component_mask,
-                )
-                view.add_to(output, rows)
-        self.network.train(training)
-        newest = context(stacked, self.packed.face_component, components)
-        return compose(output, newest, residual=self.network.config.residual)
+    def predict(self, inputs: FrameInputs) -> Step | VertexStep:
+        """The network, step 2: what happens next."""
+        with self.timings("network"):
+            return self.network.predict(inputs, self.layout, bfloat16=self.half)
 
     def reconstruct(
-        self, vertices: torch.Tensor, step: Step, features: torch.Tensor, next_body: torch.Tensor
+        self, vertices: torch.Tensor, step: Step | VertexStep, features: torch.Tensor, next_body: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Steps 3 and 4: the predicted deformation gradients become positions.
+        """Steps 3 and 4: the predicted deformation gradients become positions; predicted positions only meet the pins.
 
         Args:
             vertices: Of the newest frame [m], shape [V,3].
@@ -193,6 +177,12 @@ class Scene:
             Positions [V,3], and which garments are finite [B]; the others are where they were.
         """
         packed = self.packed
+        if isinstance(step, VertexStep):
+            positions = step.positions
+            if self.pins is not None:
+                positions = positions.index_copy(0, packed.pins.long(), self.pins.targets(next_body))
+            every = torch.ones(packed.count, dtype=torch.bool, device=vertices.device)
+            return self.keep_finite(positions, vertices, every)
         with self.timings("singular values"):
             replace = self.network.config.replace_singular_values
             if step.psi.requires_grad or features.requires_grad:
