@@ -9,11 +9,10 @@ import torch
 
 from warpgarment.errors import CheckpointError
 from warpgarment.nn import checkpoint
-from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.network import build_network
+from warpgarment.nn.architecture import build_network, preset
 from warpgarment.nn.network import GarmentNetwork
 
-SHAPES = {"small": NetworkConfig.small, "fast": NetworkConfig.fast, "base": NetworkConfig.base}
+SHAPES = ("small", "fast", "base")
 DEFAULT = ("small", "fast")
 
 
@@ -41,5 +40,5 @@ def _named(name: str) -> Named:
             raise
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            return Named(f"{name}, untrained", build_network(SHAPES[name]()))
+            return Named(f"{name}, untrained", build_network(preset(name)).eval())
     return Named(name, checkpoint.load(path))

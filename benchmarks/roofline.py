@@ -27,8 +27,9 @@ from benchmarks.measure import NO_GPU, Row, figures, interleaved
 from benchmarks.networks import Named
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
 from warpgarment.kernels.features.channels import FEATURES
+from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.flops import forward_flops
+from warpgarment.nn.inputs import FrameInputs
 from warpgarment.nn.patches.layout import SHARES, PatchLayout
 from warpgarment.objects.garment import POOLED
 from warpgarment.sim.simulator import Simulator
@@ -107,15 +108,17 @@ def _rows(
             stacked = torch.randn(total, config.history, FEATURES, device=device)
             velocities = torch.randn(scene.packed.component_count, config.history - 1, 3, device=device)
 
-            def call(half: bool, scene=scene, stacked=stacked, velocities=velocities) -> None:
+            places = (torch.empty(0, 3, device=device),) * 3  # of cloth and bodies, which these networks do not look at
+
+            def call(half: bool, scene=scene, stacked=stacked, velocities=velocities, places=places) -> None:
                 scene.half = half
                 with torch.inference_mode():
-                    scene.predict(stacked, velocities)
+                    scene.predict(FrameInputs(stacked, velocities, *places))
 
             calls = {"float32": lambda call=call: call(False), "bfloat16": lambda call=call: call(True)}
-            layout = scene.views[0].weights
+            layout = scene.layout.views[0].weights
             patches = layout.start.shape[1] if isinstance(layout, PatchLayout) else 0
-            operations = number * sum(forward_flops(config, count, components, patches))
+            operations = number * sum(architecture(config.architecture).flops(config, count, components, layout))
             for name, times in interleaved(calls, device, seconds).items():
                 moved = network_bytes(config, count, components, number, parameters, PRECISIONS[name].itemsize, patches)
                 measured = figures(times)

@@ -36,7 +36,6 @@ from warpgarment.kernels.sdf.closest import MAX_DISTANCE, Bodies, closest_on_bod
 from .channels import FEATURES, LAYOUT
 
 AT = {name: place.start for name, place in LAYOUT.items()}
-
 TOUCHING = wp.constant(1.0e-9)  # metres; closer than this, a point has no direction to the body
 # Height over longest edge; the motion of thinner body faces is mostly rounding
 SLIVER = wp.constant(wp.float64(1.0e-4))

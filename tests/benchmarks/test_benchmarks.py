@@ -15,8 +15,9 @@ from benchmarks.measure import aimed_time, compared, interleaved
 from benchmarks.networks import named
 from warpgarment.errors import CheckpointError
 from warpgarment.nn import checkpoint
+from warpgarment.nn.architecture import build_network
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
 
 EXPECTED = {  # part: what its rows must be about, and references beside them
     "geodesics": ({"geodesics of all pairs of faces", "geodesics, off the exact ones"}, set()),

@@ -133,3 +133,19 @@ def test_depth_is_true_on_a_reversed_body():
         assert wg.metrics.max_penetration(inside, vertices, faces[:, ::-1]) == pytest.approx(depth, abs=1e-6)
     with pytest.warns(UserWarning, match="looked inwards"):
         assert wg.metrics.body_collision(inside, vertices, faces[:, ::-1]) == pytest.approx(2 / 3)
+
+
+def test_a_few_faces_that_disagree_are_turned_round():
+    """A garment with a few reversed faces, as of MakeHuman, would be refused, or mended in silence or wrongly."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces).astype(np.int32)
+    flipped = faces.copy()
+    flipped[[3, 50]] = flipped[[3, 50], ::-1]
+    with pytest.warns(UserWarning, match=r"2 of 80 faces of garment 'suit' disagreed.*first: face 3"):
+        garment = wg.Garment(vertices, flipped, name="suit")
+    corners = garment.vertices[garment.faces].astype(np.float64)
+    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("fi,fi->f", outwards, corners.mean(1)) > 0).all()  # the sphere is about the origin
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (wg.Garment(vertices, faces[:, ::-1]).faces == faces[:, ::-1]).all()  # all reversed: as it was given

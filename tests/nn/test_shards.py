@@ -12,9 +12,8 @@ from safetensors.torch import load_file, save_file
 
 from warpgarment.errors import CheckpointError
 from warpgarment.nn import checkpoint, shards
-from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.config import STATISTICS, NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.nn.network import STATISTICS
 
 LIMIT = 14_000  # bytes; the network below comes in three shards then
 

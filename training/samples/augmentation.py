@@ -20,12 +20,10 @@ from dataclasses import dataclass
 
 import torch
 
-from warpgarment.kernels.features.channels import FACE, Channel, Kind, Layout
 from warpgarment.nn.parametrisation import NetworkOutput
+from warpgarment.nn.run import mirror_inputs, mirror_output
 
 LARGEST_SCALE = 0.1
-VELOCITY = Layout([Channel("velocity", 3, Kind.VECTOR)])
-PSI = Layout([Channel("psi", 9, Kind.MAP)])
 
 
 @dataclass(frozen=True)
@@ -66,17 +64,4 @@ def mirror(
         target: [B,N,3,3], [B,N,3], [B,C,3].
         chosen: Which samples, bool [B].
     """
-    vector, matrix, face = (layout.mirror(features.device) for layout in (VELOCITY, PSI, FACE))
-
-    def signs(values: torch.Tensor, width: int) -> torch.Tensor:
-        values = values.repeat(width // len(values))
-        return torch.where(chosen[:, None], values, torch.ones_like(values))[:, None]
-
-    psi = target.psi.flatten(-2)
-    return (
-        features * signs(face, features.shape[-1]),
-        velocities * signs(vector, velocities.shape[-1]),
-        target._replace(
-            psi=(psi * signs(matrix, 9)).unflatten(-1, (3, 3)), velocity=target.velocity * signs(vector, 3)
-        ),
-    )
+    return *mirror_inputs(features, velocities, chosen), mirror_output(target, chosen)

@@ -23,12 +23,12 @@ class Builder(Protocol[Built]):
     Attributes:
         sequences: Training sequences.
         device: Device of the sequences, and of the batches.
-        patches: Whether batches are for a network of patches, which is also shown whole garments.
+        subsets: Whether the network may see some of a garment's faces; otherwise it is also shown whole garments.
     """
 
     sequences: list[SequenceData]
     device: torch.device
-    patches: bool
+    subsets: bool
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the recorded frames that a sample needs follow a frame."""

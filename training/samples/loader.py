@@ -61,7 +61,7 @@ class Loader(Generic[Batch]):
         pool: What the network's own rollouts did wrong, mixed in as `share` of the samples.
         share: Share of samples from the pool, where it has any that fit.
         splits: Number of subsets that a garment's faces are split into at a step; one of them is used. At 1, a
-            network of patches is shown whole garments, others as much of each as its batch's smallest has.
+            network without `subsets` is shown whole garments, others as much of each as its batch's smallest has.
         depth: Batches built ahead; 0 builds them when asked, without a thread.
         part: The samples of each batch that this process trains on.
     """
@@ -87,7 +87,7 @@ class Loader(Generic[Batch]):
         picks = self.plan.picks(step)
         splits = self.splits(step) if splits is None else splits
         sizes = [int(self.plan.sizes[s]) for s, _ in picks]
-        whole = self.builder.patches and splits == 1
+        whole = not self.builder.subsets and splits == 1
         faces = max(sizes) if whole else max(min(sizes) // splits, 1)
         displacements: list[np.ndarray | None] = [None] * len(picks)
         fitting = self.pool.fitting(self.plan.sizes, faces, whole=whole)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +12,9 @@ import torch
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, inverse_rest_frames
 from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.mesh.laplacian import components
+from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.layout import dense_weights
 from warpgarment.nn.heading import yaw
-from warpgarment.nn.patches.layout import Patches, garment_patches, patches
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.training.data.sequence import Sequence
@@ -55,7 +55,6 @@ class SequenceData:
         self.rest = torch.as_tensor(np.array(garment.vertices, np.float32), device=device)
         self.inverse_rest = inverse_rest_frames(self.rest, self.faces)
         self._geodesics, self._network = geodesics, network
-        self._kernel: torch.Tensor | None = None
 
         vertex_component, self.components = _components(len(self.rest), garment.faces)
         self.face_component = torch.as_tensor(vertex_component[garment.faces[:, 0]], dtype=torch.int64, device=device)
@@ -96,12 +95,10 @@ class SequenceData:
         return used, inverse.reshape(-1, 3)
 
     @cached_property
-    def patches(self) -> Patches:
-        """The garment's patches, for a network that has them."""
-        garment, distances = self.source.garment, self._geodesics
-        if distances is None:
-            return garment_patches(garment, self._network.patch_spacing)
-        return patches(garment.vertices, garment.faces, self._network.patch_spacing, lambda face: distances[face])
+    def shown(self) -> Any:
+        """How the garment's faces lie on the cloth, as `Architecture.rows` is given it for samples."""
+        kind = architecture(self._network.architecture)
+        return kind.sampled(kind.geometry(self.garment, self._network), self._network, self.device)
 
     @property
     def count(self) -> int:
@@ -114,26 +111,6 @@ class SequenceData:
             phi = deformation_gradient_from_inverse(self.inverse_rest, vertices.contiguous(), self.faces)
             angles.append(yaw(phi[None]))
         return torch.cat(angles)
-
-    def weights(self, subset: np.ndarray, scale: float = 1.0) -> torch.Tensor:
-        """Geodesic weights of some faces [n] of the garment, `scale` times as large; float32 [n,n]."""
-        power, radius = self._network.geodesic_power, self._network.geodesic_radius
-        if self._geodesics is None:
-            return dense_weights(self.source.garment.pooled_geodesics, subset, radius / scale, power, self.device)
-        chosen = torch.from_numpy(subset).to(self.device)
-        kernel = self.kernel[chosen[:, None], chosen[None, :]].float()
-        if scale != 1.0:  # exp(-(s D/r)^p) = exp(-(D/r)^p)^(s^p)
-            kernel = kernel ** float(scale**power)
-        return kernel / kernel.sum(dim=1, keepdim=True)
-
-    @property
-    def kernel(self) -> torch.Tensor:
-        """exp(-(D/r)^p), float16 [F,F]: geodesic weights of any subset of faces are its rows, divided by their sums."""
-        if self._kernel is None:
-            distances = torch.from_numpy(np.array(self._geodesics))
-            kernel = torch.exp(-((distances / self._network.geodesic_radius) ** self._network.geodesic_power))
-            self._kernel = kernel.to(device=self.device, dtype=torch.float16)
-        return self._kernel
 
 
 def _writable(array: np.ndarray) -> np.ndarray:

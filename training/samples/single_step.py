@@ -10,13 +10,13 @@ too:
 
 so the answer leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces
 and frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but
-components. A network of patches is shown neighbours where the faces are not a subset: then whole garments make a batch,
-padded with copies of a face that do not count.
+components. Some networks are to see all faces (`Architecture.subsets`): then whole garments make a batch, padded with
+copies of a face that do not count.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,11 +25,11 @@ from warpgarment.kernels.deformation.gradients import deformation_gradient_from_
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.channels import FEATURES, INTERACTION, LAYOUT
 from warpgarment.kernels.features.face import face_features
+from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
 from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
-from warpgarment.nn.patches.layout import Patches, PatchLayout, patch_layout
 
 from .augmentation import Augmentation, mirror
 from .drawing import Past, displacement, part_of
@@ -46,7 +46,7 @@ class Batch(NamedTuple):
 
     features: torch.Tensor  # [B,N,H*34] oldest first
     velocities: torch.Tensor  # [B,C,(H-1)*3]
-    weights: torch.Tensor | PatchLayout  # [B,N,N] geodesic; or patches
+    weights: Any  # how the faces lie on the cloth, from `Architecture.rows`; geodesic weights [B,N,N], for one
     velocity_mask: torch.Tensor | None  # [B,C] bool; None where all garments have C components
     components: torch.Tensor  # scalar: garment components of the whole batch, times the share of it that this is
     target: NetworkOutput  # what the network should say
@@ -61,9 +61,15 @@ class Batch(NamedTuple):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is kept of a batch whose loss is not finite."""
-        weights = self.weights.weights if isinstance(self.weights, PatchLayout) else self.weights
-        tensors = {"features": self.features, "velocities": self.velocities, "weights": weights}
-        return {name: tensor.cpu().numpy() for name, tensor in (tensors | self.target._asdict()).items()}
+        weights = {"weights": self.weights} if isinstance(self.weights, torch.Tensor) else _tensors(self.weights)
+        tensors = {"features": self.features, "velocities": self.velocities, **weights, **self.target._asdict()}
+        return {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+
+
+def _tensors(layout: Any) -> dict[str, torch.Tensor]:
+    """The tensors among the fields of a named tuple; none of anything else."""
+    fields = layout._asdict() if hasattr(layout, "_asdict") else {}
+    return {name: value for name, value in fields.items() if isinstance(value, torch.Tensor)}
 
 
 class SampleBuilder:
@@ -82,7 +88,8 @@ class SampleBuilder:
         self.sequences, self.network = sequences, network
         self.noise, self.augmentation = noise, augmentation
         self.device = sequences[0].device
-        self.patches = network.architecture == "patches"
+        self.kind = architecture(network.architecture)
+        self.subsets = self.kind.subsets
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the recorded frames that a sample needs follow a frame."""
@@ -101,8 +108,8 @@ class SampleBuilder:
 
         Args:
             picks: Sequence index and newest frame of each sample.
-            faces: Number N of faces per sample, a random subset; every garment has as many. For a network of patches
-                also None: all of every garment.
+            faces: Number N of faces per sample, a random subset; every garment has as many. For a kind of network
+                without `subsets` also None: all of every garment.
             rng: All randomness comes from here: sample b draws from the b-th stream it spawns.
             displacements: Per sample None or [K,V,3] metres, K <= history: an override of the newest K frames, relative
                 to the recorded positions; noise comes on top.
@@ -123,8 +130,7 @@ class SampleBuilder:
         positions, following, corners, next_corners, means = [], [], [], [], []
         rows = torch.empty(count, faces, history, INTERACTION.width, device=device)
         inverse_rest = torch.empty(count, faces, 3, 3, device=device)
-        weights = None if self.patches else torch.empty(count, faces, faces, device=device)
-        shown: list[Patches] = []
+        shown: list[tuple[Any, np.ndarray | None]] = []
         velocities = torch.zeros(count, components, (history - 1) * 3, device=device)
         velocity = torch.zeros(count, components, 3, device=device)
         body_velocity = torch.zeros(count, components, 3, device=device)
@@ -137,10 +143,7 @@ class SampleBuilder:
                 subset[sizes[b] :] = 0
             else:
                 subset = np.sort(rng.permutation(len(sequence.faces))[:faces])
-            if self.patches:
-                shown.append(sequence.patches if whole_garments else sequence.patches.subset(subset))
-            if weights is not None:
-                weights[b] = sequence.weights(subset, scale[b])
+            shown.append((sequence.shown, None if whole_garments else subset))
             seen = self._send(subset)
             begins = Past.of(t, history, device)
             past = sequence.vertices[begins.frames]
@@ -197,14 +200,14 @@ class SampleBuilder:
             mask = self._send(np.arange(components)[None] < np.array(real)[:, None])
         share = torch.full((), sum(whole) * count / len(whole), device=device)
         ids = [(self.sequences[s].name, t) for s, t in picks]
-        if weights is not None:
+        weights = self.kind.rows(shown, self.network, device, scale)
+        if self.subsets and not whole_garments:
             return Batch(features, velocities, weights, mask, share, target, ids)
-        layout = patch_layout(shown, self.network.geodesic_radius, self.network.geodesic_power, device, scale)
         face_mask = None
         if min(sizes) < faces:
             face_mask = self._send(np.arange(faces)[None] < np.array(sizes)[:, None])
         total = torch.full((), all_faces * count / len(whole), device=device)
-        return Batch(features, velocities, layout, mask, share, target, ids, face_mask, total)
+        return Batch(features, velocities, weights, mask, share, target, ids, face_mask, total)
 
     def _drawn(
         self, picks: list[tuple[int, int]], streams: list[np.random.Generator]

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgarment.kernels.features.channels import FACE, FEATURES, INTERACTION
+from warpgarment.kernels.features.channels import INTERACTION
+from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
@@ -49,7 +50,9 @@ class UnrolledBatch:
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
         """Samples, and operations of a training step on them (`nn/flops.py`)."""
-        views = [(*view.face_index.shape, view.component_index.shape[1], view.weights) for view in self.scene.views]
+        views = [
+            (*view.face_index.shape, view.component_index.shape[1], view.weights) for view in self.scene.layout.views
+        ]
         return len(self.ids), len(self.recorded) * work(config, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -57,22 +60,6 @@ class UnrolledBatch:
         tensors = {"features": self.history.stacked(self.features), "velocities": self.history.velocities}
         tensors |= {"vertices": self.vertices, "recorded": torch.stack(self.recorded), "faces": self.scene.packed.faces}
         return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
-
-
-def turned(
-    features: torch.Tensor, velocities: torch.Tensor, turn: torch.Tensor, joint: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """What a network sees of a turned world: v -> G v, D -> G D G^T, and Phi -> G Phi J^T as the rest pose turns by J.
-
-    Args:
-        features: Stacked, [R,N,H*34].
-        velocities: [R,C,(H-1)*3].
-        turn: G, [R,3,3].
-        joint: J, [R,3,3].
-    """
-    rows = features.unflatten(-1, (-1, FEATURES))
-    seen = (rows.flatten(1, 2) @ FACE.turn(turn, joint).mT).reshape(features.shape)
-    return seen, (velocities.unflatten(-1, (-1, 3)) @ turn[:, None].mT).flatten(-2)
 
 
 class UnrolledBuilder:
@@ -99,7 +86,7 @@ class UnrolledBuilder:
         self.sequences, self.network = sequences, network
         self.noise, self.augmentation = noise, augmentation
         self.device = sequences[0].device
-        self.patches = network.config.architecture == "patches"
+        self.subsets = architecture(network.config.architecture).subsets
         self.steps, self.collision_passes = steps, collision_passes
 
     def reaches(self, sequence: int, newest: int) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from warpgarment.nn.architecture import architecture, preset
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.training.samples.augmentation import Augmentation
 from warpgarment.training.samples.noise import NoiseConfig
@@ -111,14 +112,24 @@ class TrainConfig:
 
     def network_config(self) -> NetworkConfig:
         """The network's shape with the overrides applied."""
-        kinds: dict[str, type] = {f.name: type(f.default) for f in dataclasses.fields(NetworkConfig)}
-        changes = {}
-        for text in self.overrides:
-            name, _, value = text.partition("=")
-            if name not in kinds:
-                raise ValueError(f"no network setting {name!r}; there are {', '.join(kinds)}")
-            kind = kinds[name]
-            if kind is bool and value.lower() not in ("true", "false"):
-                raise ValueError(f"{name} must be true or false, got {value!r}")
-            changes[name] = value.lower() == "true" if kind is bool else kind(value)
-        return getattr(NetworkConfig, self.network)(**changes)
+        named = preset(self.network)
+        texts = dict(text.partition("=")[::2] for text in self.overrides)
+        kind = architecture(texts.get("architecture", named.architecture)).config
+        defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+        values = {name: value for name, value in vars(named).items() if name in defaults}
+        for name, text in texts.items():
+            if name not in defaults:
+                raise ValueError(f"no network setting {name!r}; there are {', '.join(defaults)}")
+            values[name] = _value(name, text, type(defaults[name]))
+        return kind(**values)
+
+
+def _value(name: str, text: str, kind: type) -> Any:
+    """A setting as its text says."""
+    if kind is tuple:
+        return tuple(text.split(","))
+    if kind is not bool:
+        return kind(text)
+    if text.lower() not in ("true", "false"):
+        raise ValueError(f"{name} must be true or false, got {text!r}")
+    return text.lower() == "true"

@@ -9,14 +9,16 @@ weights, of which autocast makes copies.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
+from warpgarment.nn.inputs import RowInputs
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import NetworkOutput
-from warpgarment.nn.patches.layout import PatchLayout
+from warpgarment.nn.run import run
 from warpgarment.training.distributed import Group
 from warpgarment.training.samples.single_step import Batch
 from warpgarment.training.samples.unrolled import UnrolledBatch
@@ -63,7 +65,7 @@ class Objective(nn.Module):
         self,
         features: torch.Tensor,
         velocities: torch.Tensor,
-        weights: torch.Tensor | PatchLayout,
+        weights: Any,
         velocity_mask: torch.Tensor | None,
         components: torch.Tensor,
         target: tuple[torch.Tensor, ...],
@@ -71,17 +73,11 @@ class Objective(nn.Module):
         faces: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """The fields of `Batch`; returns [4], the numbers of `Losses`, in float32."""
-        network = self.network
-        x, v = network.encode(features, velocities)
-        if self.noise:
-            x = x + self.noise * torch.randn_like(x)
-            v = v + self.noise * torch.randn_like(v)
-        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.in_bfloat16):
-            predicted = network.forward_normalised(x, v, weights, face_mask=face_mask, velocity_mask=velocity_mask)
-        normalised = network.normalise_targets(NetworkOutput(*target))
-        return torch.stack(
-            loss(predicted, normalised, network, self.config, velocity_mask, components, face_mask, faces)
-        )
+        rows = RowInputs(features, velocities, weights, face_mask, velocity_mask, in_network_frame=True)
+        ran = run(self.network, rows, noise=self.noise, bfloat16=self.in_bfloat16, target=NetworkOutput(*target))
+        assert ran.target is not None  # as one was given
+        parts = velocity_mask, components, face_mask, faces
+        return torch.stack(loss(ran.normalised, ran.target, self.network, self.config, *parts))
 
 
 class Trainer:

@@ -25,9 +25,7 @@ import torch
 
 from warpgarment.io.atomic import atomic_file
 from warpgarment.nn import checkpoint
-from warpgarment.nn.faces.grow import grow
-from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
-from warpgarment.nn.patches.network import PatchTransformer
+from warpgarment.nn.architecture import architecture, build_network
 from warpgarment.training.distributed import Group, GroupError
 from warpgarment.training.samples.loader import Plan
 from warpgarment.training.samples.single_step import SampleBuilder
@@ -67,12 +65,9 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     group.part(config.batch_size)
     torch.manual_seed(config.seed)
     if config.init is not None:
-        network = checkpoint.load(checkpoint.find(config.init), device=group.device)
+        given = checkpoint.load(checkpoint.find(config.init), device=group.device)
         wanted = config.network_config()
-        if config.grow:
-            network = grow(network, wanted)
-        elif isinstance(network, ManifoldAwareTransformer) and wanted.architecture == "patches":
-            network = PatchTransformer.from_faces(network, wanted).to(group.device)
+        network = architecture(wanted.architecture).start_from(given, wanted, grow=config.grow)
     else:
         network = build_network(config.network_config()).to(group.device)
     skipped: dict[str, str] = {}

@@ -36,12 +36,11 @@ from torch import nn
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.channels import LAYOUT
-from warpgarment.nn.heading import canonical_frame
-from warpgarment.nn.network import GarmentNetwork, rotate_output
+from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
 from warpgarment.nn.rows import PaddedView
-from warpgarment.training.samples.augmentation import mirror
-from warpgarment.training.samples.unrolled import UnrolledBatch, turned
+from warpgarment.nn.run import run
+from warpgarment.training.samples.unrolled import UnrolledBatch
 
 from .losses import LossConfig, weighted
 
@@ -154,7 +153,7 @@ class UnrolledObjective(nn.Module):
         """Output of the network for packed inputs [F,H*34] and [C,(H-1)*3], and its losses [4] against a target."""
         output = NetworkOutput(*(torch.zeros_like(part) for part in target))
         terms = stacked.new_zeros(4)
-        for view in batch.scene.views:
+        for view in batch.scene.layout.views:
             rows, losses = self._view(batch, view, stacked, velocities, target)
             view.add_to(output, rows)
             terms = terms + losses
@@ -169,33 +168,19 @@ class UnrolledObjective(nn.Module):
         target: NetworkOutput,
     ) -> tuple[NetworkOutput, torch.Tensor]:
         """The same for the rows of a view: output in world space, and their share of the losses."""
-        network, garment = self.network, batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
-        x, v = view.faces(stacked), view.components(velocities)
+        garment = batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
+        rows = view.inputs(stacked, velocities)._replace(
+            turn=batch.turn[garment], rest_turn=batch.joint[garment], mirrored=batch.mirrored[garment]
+        )
         wanted = NetworkOutput(
             view.faces(target.psi), view.faces(target.singular_values), view.components(target.velocity)
         )
-        turn = batch.turn[garment]
-        if network.config.heading == "canonical":
-            turn = turn @ canonical_frame(x, view.face_mask)
-        x, v = turned(x, v, turn, batch.joint[garment])
-        wanted, mirrored = rotate_output(wanted, turn), batch.mirrored[garment]
-        x, v, wanted = mirror(x, v, wanted, mirrored)
-        x_in, v_in = network.encode(x, v)
-        if self.noise:
-            x_in = x_in + self.noise * torch.randn_like(x_in)
-            v_in = v_in + self.noise * torch.randn_like(v_in)
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.in_bfloat16):
-            predicted = network.forward_normalised(
-                x_in, v_in, view.weights, face_mask=view.face_mask, velocity_mask=view.component_mask
-            )
+        ran = run(self.network, rows, noise=self.noise, bfloat16=self.in_bfloat16, target=wanted)
+        assert ran.target is not None  # as one was given
         face_weight = view.faces(batch.face_weight)
         face_weight = face_weight if view.face_mask is None else face_weight * view.face_mask
-        component_weight = (view.share[:, None] / batch.components).expand(v.shape[:2])
+        component_weight = (view.share[:, None] / batch.components).expand(rows.velocities.shape[:2])
         if view.component_mask is not None:
             component_weight = component_weight * view.component_mask
-        losses = weighted(
-            predicted, network.normalise_targets(wanted), network, self.config, face_weight, component_weight
-        )
-        predicted = type(predicted)(*(part.float() for part in predicted))
-        said = mirror(x, v, network.denormalise(predicted), mirrored)[2]
-        return rotate_output(said, turn, inverse=True), torch.stack(losses)
+        losses = weighted(ran.normalised, ran.target, self.network, self.config, face_weight, component_weight)
+        return ran.output, torch.stack(losses)

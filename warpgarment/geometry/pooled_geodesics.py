@@ -43,6 +43,11 @@ class PooledGeodesics(NamedTuple):
     nearest: np.ndarray  # int32 [F,NEAR], centres near each face; 0 where the weight is 0
     weight: np.ndarray  # float32 [F,NEAR], weights of these centres; rows sum to one
 
+    @property
+    def faces(self) -> int:
+        """Number of faces F."""
+        return len(self.nearest)
+
 
 def pooled_geodesics(rest_vertices: Any, faces: Any, centres: int = CENTRES) -> PooledGeodesics:
     """Distances between centres, and the interpolation from them to all faces.

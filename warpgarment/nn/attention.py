@@ -13,14 +13,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from warpgarment.nn.faces.layout import PooledWeights
-
 ACTIVATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"relu": F.relu, "gelu": F.gelu}
+
+
+class Spreading(Protocol):
+    """Weights [R,N,N] that are not kept as a matrix, see `faces.layout.PooledWeights`."""
+
+    @property
+    def faces(self) -> int:
+        """Number of faces N."""
+
+    def spread(self, value: torch.Tensor) -> torch.Tensor:
+        """Weights times values, [R,N,K] -> [R,N,K]; R may be one where the values' is not."""
 
 
 def geodesic_weights(distances: torch.Tensor, radius: float, power: float) -> torch.Tensor:
@@ -65,7 +75,7 @@ class ManifoldAwareAttention(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(
-        self, x: torch.Tensor, weights: torch.Tensor | PooledWeights, key_mask: torch.Tensor | None
+        self, x: torch.Tensor, weights: torch.Tensor | Spreading, key_mask: torch.Tensor | None
     ) -> torch.Tensor:
         """Attends.
 
@@ -98,14 +108,13 @@ class ManifoldAwareAttention(nn.Module):
         return self.out(outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=-1))
 
 
-def _spread(weights: torch.Tensor | PooledWeights, value: torch.Tensor) -> torch.Tensor:
+def _spread(weights: torch.Tensor | Spreading, value: torch.Tensor) -> torch.Tensor:
     """Weights times the values of the faces, the values of velocity tokens as they are; [B,N,N], [B,T,K] -> [B,T,K].
 
     All manifold heads share their weights, so they are one product; and so is a batch that shares one garment.
     """
-    if isinstance(weights, PooledWeights):
-        faces = weights.scale.shape[1]
-        return torch.cat([weights.spread(value[:, :faces]), value[:, faces:]], dim=1)
+    if not isinstance(weights, torch.Tensor):
+        return torch.cat([weights.spread(value[:, : weights.faces]), value[:, weights.faces :]], dim=1)
     faces = weights.shape[-1]
     face_value, velocity_value = value[:, :faces], value[:, faces:]
     if weights.shape[0] == 1 and value.shape[0] > 1:
@@ -152,7 +161,7 @@ class EncoderLayer(nn.Module):
         self.activation = ACTIVATIONS[activation]
 
     def forward(
-        self, x: torch.Tensor, weights: torch.Tensor | PooledWeights, key_mask: torch.Tensor | None
+        self, x: torch.Tensor, weights: torch.Tensor | Spreading, key_mask: torch.Tensor | None
     ) -> torch.Tensor:
         """Tokens [B,T,E] -> tokens [B,T,E]; the other arguments as in `ManifoldAwareAttention.forward`."""
         if self.norm_first:

@@ -13,31 +13,40 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from safetensors.torch import save as serialise
 
 from warpgarment.errors import CheckpointError
 from warpgarment.io.atomic import atomic_file
-from warpgarment.nn.faces.network import build_network
 
 from . import hub, shards
+from .architecture import ARCHITECTURES, architecture, build_network
 from .bounds import check_settings, checked_json
-from .config import NetworkConfig
-from .network import STATISTICS, GarmentNetwork
+from .config import STATISTICS, NetworkConfig
+
+if TYPE_CHECKING:
+    from .network import GarmentNetwork
 
 KIND = "warpgarment.network"
 FORMAT_VERSION = 1
 WEIGHTS = Path(__file__).parents[1] / "assets" / "weights"  # networks that ship with the package
-LATER = {  # settings that older checkpoints do not have: their default is how it was then
-    "replace_singular_values",
-    "architecture",
-    "patch_spacing",
-    "face_embedding",
-    "face_feed_forward",
-    "face_layers",
-    "channels",
+FIRST = {  # settings that all checkpoints have; those that came later, or with a kind of network, have their defaults
+    "embedding",
+    "layers",
+    "feed_forward",
+    "heads",
+    "manifold_heads",
+    "dropout",
+    "history",
+    "geodesic_power",
+    "geodesic_radius",
+    "residual",
+    "heading",
+    "norm_first",
+    "activation",
+    "fps",
 }
 _DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
@@ -212,11 +221,13 @@ def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[st
 
 
 def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
-    fields = {field.name: field for field in dataclasses.fields(NetworkConfig)}
+    name = settings.get("architecture")
+    described = architecture(name).config if isinstance(name, str) and name in ARCHITECTURES else NetworkConfig
+    fields = {field.name: field for field in dataclasses.fields(described)}
     unknown = sorted(settings.keys() - fields.keys())
     if unknown:
         raise CheckpointError(f"{path}: unknown settings {', '.join(unknown)}; written by a newer warpgarment?")
-    missing = sorted(fields.keys() - settings.keys() - LATER)
+    missing = sorted(FIRST - settings.keys())
     if missing:
         raise CheckpointError(f"{path}: settings {', '.join(missing)} are missing")
     for name, value in settings.items():
@@ -227,6 +238,6 @@ def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
         if not fits or (isinstance(value, bool) and kind is not bool):
             raise CheckpointError(f"{path}: setting {name} must be {kind.__name__}, got {value!r}")
     try:
-        return NetworkConfig(**settings)
+        return described(**settings)
     except ValueError as error:
         raise CheckpointError(f"{path}: {error}") from error

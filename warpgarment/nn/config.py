@@ -8,6 +8,7 @@ from typing import Any
 
 from warpgarment.kernels.features.channels import FACE
 
+from .architecture import check_name
 from .attention import ACTIVATIONS
 
 CHANNELS = (  # those of the first networks: what a checkpoint that names none reads
@@ -20,6 +21,19 @@ CHANNELS = (  # those of the first networks: what a checkpoint that names none r
     "body_velocity",
     "singular_values",
 )
+
+STATISTICS = {  # buffers of the normalisation and their lengths, for networks of these channels
+    "feature_mean": FACE.only(CHANNELS).width,
+    "feature_std": FACE.only(CHANNELS).width,
+    "velocity_mean": 3,
+    "velocity_std": 3,
+    "psi_mean": 9,
+    "psi_std": 9,
+    "singular_value_mean": 3,
+    "singular_value_std": 3,
+    "q_mean": 3,
+    "q_std": 3,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +81,7 @@ class NetworkConfig:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
         if self.heading not in ("world", "canonical"):
             raise ValueError(f'heading must be "world" or "canonical", got {self.heading!r}')
-        if self.architecture not in ("faces", "patches"):
-            raise ValueError(f'architecture must be "faces" or "patches", got {self.architecture!r}')
+        check_name(self.architecture)
         if self.activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation!r}")
         if not self.channels:

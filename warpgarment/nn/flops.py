@@ -14,13 +14,7 @@ history, width E, feed-forward width W, L layers, of whose h heads m use geodesi
       feed-forward   4 T E W
     heads            2 N E 12 + 2 C E 3
 
-A network of patches has P of them, F face width, G width of a face layer, K face layers; its encoder layers are as
-above with P for N, and around them are
-
-    embedding        2 N (34 H) F + 2 C 3 (H - 1) E
-    face layers      (K + 1) 4 N F G + K 2 N F G      pooling and spreading, a few operations a number, are not counted
-    patches          4 P F E + 2 C P F + 2 C F E      to their width and back, and the mean of each component
-    heads            2 N F 12 + 2 C E 3
+Each kind of network counts its own, in `Architecture.flops`; those of patches are in patches/architecture.py.
 
 The backward pass is two products for each of the forward pass, one for each factor's gradient, but one only where a
 factor needs no gradient: the embeddings' inputs and the geodesic weights.
@@ -33,8 +27,7 @@ from typing import Any
 
 import torch
 
-from warpgarment.nn.patches.layout import PatchLayout
-
+from .architecture import architecture
 from .config import NetworkConfig
 
 PEAKS = (  # part of the device's name, dense bfloat16 with float32 sums [FLOP/s]; the makers' data sheets
@@ -52,18 +45,7 @@ PEAKS = (  # part of the device's name, dense bfloat16 with float32 sums [FLOP/s
 )
 
 
-def forward_flops(config: NetworkConfig, faces: int, components: int, patches: int = 0) -> tuple[int, int]:
-    """Operations of one sample's forward pass: those both of whose factors need a gradient, and the others."""
-    if config.architecture == "patches":
-        return _forward_flops_patches(config, faces, components, patches)
-    heads = 2 * config.embedding * (12 * faces + 3 * components)
-    inputs = faces * config.history * config.features + components * 3 * (config.history - 1)
-    embedding = 2 * config.embedding * inputs
-    layers, geodesic = _layer_flops(config, faces, components)
-    return layers + heads, embedding + geodesic
-
-
-def _layer_flops(config: NetworkConfig, nodes: int, components: int) -> tuple[int, int]:
+def layer_flops(config: NetworkConfig, nodes: int, components: int) -> tuple[int, int]:
     """Of all encoder layers on faces or patches, and the components: with two gradients, with one."""
     e, tokens = config.embedding, nodes + components
     manifold = config.manifold_heads * (e // config.heads)
@@ -72,18 +54,9 @@ def _layer_flops(config: NetworkConfig, nodes: int, components: int) -> tuple[in
     return config.layers * layer, config.layers * 2 * nodes**2 * manifold
 
 
-def _forward_flops_patches(config: NetworkConfig, faces: int, components: int, patches: int) -> tuple[int, int]:
-    e, width = config.embedding, config.face_embedding
-    embedding = 2 * (width * faces * config.history * config.features + e * components * 3 * (config.history - 1))
-    layers, geodesic = _layer_flops(config, patches, components)
-    layers += (6 * config.face_layers + 4) * faces * width * config.face_feed_forward + 4 * patches * width * e
-    layers += 2 * components * width * (patches + e)
-    return layers + 2 * (width * 12 * faces + e * 3 * components), embedding + geodesic
-
-
-def step_flops(config: NetworkConfig, samples: int, faces: int, components: int, patches: int = 0) -> int:
-    """Operations of a training step, forward and backward, see above."""
-    both, one = forward_flops(config, faces, components, patches)
+def step_flops(config: NetworkConfig, samples: int, faces: int, components: int, rows: Any = None) -> int:
+    """Operations of a training step, forward and backward, see above; `rows` are those the network is given."""
+    both, one = architecture(config.architecture).flops(config, faces, components, rows)
     return samples * (3 * both + 2 * one)
 
 
@@ -92,14 +65,10 @@ def work(config: NetworkConfig, views: Iterable[tuple[int, int, int, Any]]) -> i
 
     Args:
         config: Of the network.
-        views: Of each call of the network: number of rows, of faces and of components of a row, and the weights it is
-            given, a `PatchLayout` for a network of patches.
+        views: Of each call of the network: number of rows, of faces and of components of a row, and what it is given of
+            the layout of the faces, from `Architecture.rows`.
     """
-    total = 0
-    for rows, faces, components, weights in views:
-        patches = weights.start.shape[1] if isinstance(weights, PatchLayout) else 0
-        total += step_flops(config, rows, faces, components, patches)
-    return total
+    return sum(step_flops(config, *view) for view in views)
 
 
 def matrix_peak(device: torch.device, precision: str) -> float | None:

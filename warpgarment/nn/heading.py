@@ -56,18 +56,19 @@ def canonical_frame(face_features: torch.Tensor, face_mask: torch.Tensor | None 
     return rotation_about_up(-yaw(phi, face_mask))
 
 
-def rotate_features(face_features: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:
+def rotate_features(face_features: torch.Tensor, frame: torch.Tensor, rest: torch.Tensor | None = None) -> torch.Tensor:
     """Features of a garment and body turned by a rotation.
 
     Args:
         face_features: Stacked features, shape [B,N,H*34].
         frame: Rotation per garment, shape [B,3,3].
+        rest: Rotation of its rest pose, shape [B,3,3]; None: it is not turned.
 
     Returns:
         Shape [B,N,H*34].
     """
     per_frame = face_features.reshape(len(face_features), -1, FEATURES)
-    return torch.bmm(per_frame, FACE.turn(frame).mT).reshape(face_features.shape)
+    return torch.bmm(per_frame, FACE.turn(frame, rest).mT).reshape(face_features.shape)
 
 
 def rotate_vectors(vectors: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:

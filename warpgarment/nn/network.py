@@ -1,82 +1,46 @@
-"""What all networks have in common: normalisation, the heading they see, statistics, files.
+"""What all networks have in common: statistics, rows of garments, one frame of a simulation, files.
 
-`forward` does everything; training takes it apart:
-
-    features, velocities, frame = network.canonicalise(features, velocities, face_mask)
-    x, v = network.encode(features, velocities)                                    # noise may be added here
-    normalised = network.forward_normalised(x, v, weights, ...)                    # losses may be taken here, against
-    target = network.normalise_targets(rotate_output(target, frame))               #   this
-    output = rotate_output(network.denormalise(normalised), frame, inverse=True)
-
-Inputs and outputs are normalised inside, with statistics that are buffers and travel with the weights. What Psi, Sigma
-and q mean is in `parametrisation.py`; `heading.py` says what `heading="canonical"` does.
+A kind of network differs in `forward_normalised`, which maps normalised inputs to normalised outputs; run.py does what
+is around that. One that answers otherwise than face by face has a `layout` and a `predict` of its own. What Psi, Sigma
+and q mean is in parametrisation.py. Statistics are buffers and travel with the weights.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import nn
 
 from warpgarment.kernels.features.channels import FACE, FEATURES
+from warpgarment.objects.garment import Garment
+from warpgarment.objects.pack import PackedGarments
 
-from . import heading as _heading
+from . import checkpoint
 from .attention import EncoderLayer
-from .config import NetworkConfig
-from .parametrisation import NetworkOutput
-
-STATISTICS = {  # buffers of the normalisation and their lengths; of features that of all channels
-    "feature_mean": FEATURES,
-    "feature_std": FEATURES,
-    "velocity_mean": 3,
-    "velocity_std": 3,
-    "psi_mean": 9,
-    "psi_std": 9,
-    "singular_value_mean": 3,
-    "singular_value_std": 3,
-    "q_mean": 3,
-    "q_std": 3,
-}
-
-
-class NormalisedOutput(NamedTuple):
-    """Output of the network, or a target for it, in units of zero mean and unit variance."""
-
-    psi: torch.Tensor  # [B,N,9]
-    singular_values: torch.Tensor  # [B,N,3]
-    velocity: torch.Tensor  # [B,C,3]
-
-
-def rotate_output(output: NetworkOutput, frame: torch.Tensor | None, *, inverse: bool = False) -> NetworkOutput:
-    """Output (or target) turned into the frame of `canonicalise`, or back out of it; unchanged where `frame` is None.
-
-    Args:
-        output: In physical units, shapes as in `NetworkOutput` with a batch in front.
-        frame: Rotation per garment, shape [B,3,3].
-        inverse: From the canonical frame to the world.
-    """
-    if frame is None:
-        return output
-    turn = frame.mT if inverse else frame
-    return NetworkOutput(
-        _heading.rotate_matrices(output.psi, turn),
-        output.singular_values,
-        _heading.rotate_vectors(output.velocity, turn),
-    )
+from .config import STATISTICS, NetworkConfig
+from .inputs import FrameInputs, NormalisedOutput, RowInputs, VertexStep
+from .parametrisation import NetworkOutput, Step, compose, context
+from .rows import RowLayout, row_layout
+from .run import run
 
 
 class GarmentNetwork(nn.Module):
-    """Predicts how each face deforms in the next frame; the kinds of it differ in `forward_normalised`.
+    """Predicts how each face deforms in the next frame, or where each vertex is.
 
     A residual network (`config.residual`) starts with zero output weights; the means of its Psi and q are identity and
     zero, so that, untrained, it moves the garment like skin. `set_statistics` keeps those means.
 
     Args:
         config: Its shape and settings.
+
+    Attributes:
+        reads: Those of `previous`, `materials`, `wind` and `pairs` of `FrameInputs` that `predict` needs.
     """
+
+    reads: ClassVar[frozenset[str]] = frozenset()
 
     face_head: nn.Linear
     velocity_head: nn.Linear
@@ -148,34 +112,42 @@ class GarmentNetwork(nn.Module):
         Returns:
             To be read by `parametrisation.compose`. Entries of padding mean nothing, and are finite.
         """
-        kind = face_features.device.type
-        half = torch.is_autocast_enabled(kind)
-        with torch.autocast(kind, enabled=False):  # half precision is for the transformer, not for positions
-            face_features, velocities, frame = self.canonicalise(face_features, velocities, face_mask)
-            x, v = self.encode(face_features, velocities)
-        with torch.autocast(kind, dtype=torch.get_autocast_dtype(kind), enabled=half):
-            normalised = self.forward_normalised(x, v, weights, face_mask=face_mask, velocity_mask=velocity_mask)
-        with torch.autocast(kind, enabled=False):
-            return rotate_output(self.denormalise(normalised), frame, inverse=True)
+        inputs = RowInputs(face_features, velocities, weights, face_mask, velocity_mask)
+        return run(self, inputs).output
 
-    def canonicalise(
-        self, face_features: torch.Tensor, velocities: torch.Tensor, face_mask: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Turns inputs to the heading the network knows; a network with heading "world" leaves them as they are.
+    def layout(self, garments: Sequence[Garment], packed: PackedGarments, *, face_splits: int = 1) -> Any:
+        """What `predict` needs to know of a batch, made once per simulation.
 
-        Returns:
-            Features, velocities, and the rotation [B,3,3] that was applied (None for "world"), for `rotate_output`.
+        Args:
+            garments: The batch.
+            packed: The same, packed on the device.
+            face_splits: Disjoint subsets that each garment's faces are shown in, where the kind of network allows it.
         """
-        if self.config.heading == "world":
-            return face_features, velocities, None
-        frame = _heading.canonical_frame(face_features, face_mask)
-        turned = _heading.rotate_features(face_features, frame)
-        return turned, _heading.rotate_vectors(velocities, frame), frame
+        return row_layout(packed, garments, self.config, face_splits)
 
-    def encode(self, face_features: torch.Tensor, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Normalises (canonical) inputs; the same statistics serve all frames of the history."""
+    def predict(self, inputs: FrameInputs, layout: Any, *, bfloat16: bool = False) -> Step | VertexStep:
+        """What happens from frame t to t+1.
+
+        Args:
+            inputs: Frame t.
+            layout: From `layout`, a `RowLayout` here.
+            bfloat16: As in `run`.
+        """
+        assert isinstance(layout, RowLayout)
+        features, velocities = inputs.features.flatten(1), inputs.velocities.flatten(1)
+        faces, components = len(features), len(velocities)
+        output = NetworkOutput(
+            features.new_empty((faces, 3, 3)), features.new_empty((faces, 3)), features.new_zeros((components, 3))
+        )
+        for view in layout.views:
+            view.add_to(output, run(self, view.inputs(features, velocities), bfloat16=bfloat16).output)
+        newest = context(features, layout.face_component, components)
+        return compose(output, newest, residual=self.config.residual)
+
+    def encode(self, face_features: torch.Tensor) -> torch.Tensor:
+        """Normalises features in the network's frame; the same statistics serve all frames of the history."""
         x = (self.read(face_features).unflatten(-1, (-1, self.channels.width)) - self.feature_mean) / self.feature_std
-        return x.flatten(-2), self.encode_velocities(velocities)
+        return x.flatten(-2)
 
     def read(self, face_features: torch.Tensor) -> torch.Tensor:
         """Those of the features [...,H*34] that this network reads, `config.channels`; [...,H*K]."""
@@ -184,19 +156,57 @@ class GarmentNetwork(nn.Module):
         return FACE.take(face_features.unflatten(-1, (-1, FEATURES)), self.channels.names).flatten(-2)
 
     def encode_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
-        """Normalises (canonical) velocities."""
+        """Normalises velocities in the network's frame."""
         return ((velocities.unflatten(-1, (-1, 3)) - self.velocity_mean) / self.velocity_std).flatten(-2)
 
     def forward_normalised(
         self,
         x: torch.Tensor,
         v: torch.Tensor,
-        weights: Any,
+        rows: Any,
         *,
         face_mask: torch.Tensor | None = None,
-        velocity_mask: torch.Tensor | None = None,
+        component_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
-        """The network itself: normalised inputs to normalised outputs, shapes as in `forward`."""
+        """The network itself: normalised inputs to normalised outputs.
+
+        Args:
+            x: Features of the channels it reads, oldest frame first, shape [R,N,H*K].
+            v: Velocities of components, shape [R,C,(H-1)*3].
+            rows: From the `rows` of its `Architecture`.
+            face_mask: True where a face is real, shape [R,N]; None where all are.
+            component_mask: True where a component is real, shape [R,C]; None where all are.
+
+        Returns:
+            In float32, under autocast too. Entries of padding mean nothing, and are finite.
+        """
+        raise NotImplementedError
+
+    def embedded(
+        self, face_features: torch.Tensor, turn: torch.Tensor | None, face_mask: torch.Tensor | None
+    ) -> torch.Tensor | None:
+        """A short cut: the first layer's answer to features in world space, with turn and normalisation folded into it.
+
+        Args:
+            face_features: All channels, physical units, shape [R,N,H*K].
+            turn: Rotation to the network's frame, shape [R,3,3]; None: none.
+            face_mask: As in `forward_normalised`.
+
+        Returns:
+            What `forward_embedded` takes instead of x; None, as here, where there is no short cut.
+        """
+        return None
+
+    def forward_embedded(
+        self,
+        embedded: torch.Tensor,
+        v: torch.Tensor,
+        rows: Any,
+        *,
+        face_mask: torch.Tensor | None = None,
+        component_mask: torch.Tensor | None = None,
+    ) -> NormalisedOutput:
+        """`forward_normalised` from what `embedded` returned."""
         raise NotImplementedError
 
     def denormalise(self, normalised: NormalisedOutput) -> NetworkOutput:
@@ -247,13 +257,9 @@ class GarmentNetwork(nn.Module):
 
     def save(self, path: str | os.PathLike[str], *, dtype: torch.dtype | None = None) -> None:
         """Writes a checkpoint; see `checkpoint.save`."""
-        from . import checkpoint
-
         checkpoint.save(self, path, dtype=dtype)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], device: torch.device | str | None = None) -> GarmentNetwork:
         """Reads a checkpoint; see `checkpoint.load`."""
-        from . import checkpoint
-
         return checkpoint.load(path, device=device)

@@ -8,26 +8,22 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from warpgarment.geometry.pooled_geodesics import CENTRES
-from warpgarment.nn.faces.layout import PooledWeights, pooled_weights
-from warpgarment.nn.patches.layout import PatchLayout, garment_patches, patch_layout
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
-from .attention import geodesic_weights
+from .architecture import architecture
 from .config import NetworkConfig
+from .inputs import RowInputs
 from .parametrisation import NetworkOutput
 
 TOKENS_PER_VIEW = 131_072  # faces in one call of the network: bounds its activations to a few GB
-
-
 WEIGHTS_PER_VIEW = 2**30  # entries of geodesic weights in one call: 4 GB
-
-
+TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps some more, of half the size
 PADDING = 1.25  # rows share a view when the longest has at most this many times the faces of the shortest
 
 
@@ -39,8 +35,7 @@ class PaddedView:
     face_mask: torch.Tensor | None  # bool [R,N]; None where nothing is padded
     component_index: torch.Tensor  # int64 [R,C], into the packed components; 0 where padded
     component_mask: torch.Tensor | None  # bool [R,C]
-    # geodesic weights, [R,N,N] or [1,N,N], pooled for large garments; or patches, of R rows or one:
-    weights: torch.Tensor | PooledWeights | PatchLayout
+    weights: Any  # from `Architecture.rows`, of R rows, or of one that serves them all
     share: torch.Tensor  # [R], one over the number of rows of the same garment
     real_faces: torch.Tensor | None  # int64, where face_mask is True in rows end to end; None where all are
     real_components: torch.Tensor | None  # the same of component_mask
@@ -54,6 +49,11 @@ class PaddedView:
         """Values of the packed components in rows; [C,...] -> [R,C,...]."""
         return packed[self.component_index]
 
+    def inputs(self, features: torch.Tensor, velocities: torch.Tensor) -> RowInputs:
+        """These rows of packed features [F,H*K] and velocities [C,(H-1)*3]."""
+        rows = self.faces(features), self.components(velocities)
+        return RowInputs(*rows, self.weights, self.face_mask, self.component_mask)
+
     def add_to(self, packed: NetworkOutput, rows: NetworkOutput) -> None:
         """Writes what the network said of these rows into packed arrays.
 
@@ -66,6 +66,20 @@ class PaddedView:
         packed.velocity.index_add_(0, *_those(self.real_components, self.component_index, velocity))
 
 
+class RowLayout(NamedTuple):
+    """A packed batch as a network wants it that answers face by face."""
+
+    views: list[PaddedView]
+    face_component: torch.Tensor  # int32 [F], of the packed faces
+
+
+def row_layout(
+    packed: PackedGarments, garments: Sequence[Garment], config: NetworkConfig, face_splits: int = 1
+) -> RowLayout:
+    """Arguments as in `padded_views`."""
+    return RowLayout(padded_views(packed, garments, config, face_splits), packed.face_component)
+
+
 def padded_views(
     packed: PackedGarments, garments: Sequence[Garment], config: NetworkConfig, face_splits: int = 1
 ) -> list[PaddedView]:
@@ -76,10 +90,10 @@ def padded_views(
         garments: The same garments, for their geodesic distances.
         config: Of the network.
         face_splits: Disjoint subsets of faces per garment, each seen by the network alone: faces s, s+n, s+2n, ...
-            Attention costs n times less, and a face no longer hears all others. A network of patches sees whole
-            garments always.
+            Attention costs n times less, and a face no longer hears all others. Kinds of networks without `subsets`
+            see whole garments always.
     """
-    if config.architecture == "patches":
+    if not architecture(config.architecture).subsets:
         face_splits = 1
     groups = row_groups(garments, config, face_splits)
     return [_view(packed, garments, config, face_splits, group) for group in groups]
@@ -97,7 +111,8 @@ def row_groups(
     """
     if face_splits < 1:
         raise ValueError(f"face_splits must be at least 1, got {face_splits}")
-    if config.architecture == "patches":
+    kind = architecture(config.architecture)
+    if not kind.subsets:
         face_splits = 1
     rows = []
     for number, garment in enumerate(garments):
@@ -109,18 +124,31 @@ def row_groups(
     for row in rows:
         if groups:
             longest, together = groups[-1][0][2], len(groups[-1]) + 1
-            if config.architecture == "patches":
-                fits, alike = together * longest <= TOKENS_PER_VIEW, True
-            else:
-                pooled = garments[row[0]].pools
-                entries = CENTRES**2 if pooled else longest**2
-                fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
-                alike = pooled == garments[groups[-1][0][0]].pools
+            garment, first = garments[row[0]], garments[groups[-1][0][0]]
+            entries = kind.entries(garment, longest, config)
+            fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
+            alike = kind.alike(garment) == kind.alike(first)
             if fits and alike and longest <= PADDING * row[2]:
                 groups[-1].append(row)
                 continue
         groups.append([row])
     return groups
+
+
+def activation_bytes(tokens: int, stack: int, stacks: tuple[float, float], width: int, hidden: int, half: bool) -> int:
+    """Bytes that a call of a transformer needs in passing, by factors that were measured with torch's profiler.
+
+    Args:
+        tokens: Number of faces in the call, padded ones included.
+        stack: Bytes of the stacked features of a face.
+        stacks: Copies of these, while they are prepared and while the network runs.
+        width: Of a token.
+        hidden: Of its feed-forward layer.
+        half: Whether it runs in bfloat16.
+    """
+    inside = stacks[1] * stack + (2 * (TOKENS + 1.5) if half else 4 * TOKENS) * width
+    inside += 4 * max(0, 2 * hidden - 3 * width)
+    return int(tokens * max(stacks[0] * stack, inside))
 
 
 def _view(
@@ -140,48 +168,23 @@ def _view(
         mine = range(packed.component_offsets[g], packed.component_offsets[g + 1])
         component_index[r, : len(mine)] = mine
 
-    weights: torch.Tensor | PooledWeights | PatchLayout
+    kind = architecture(config.architecture)
     shared = len({(id(garments[g]), first) for g, first, _ in rows}) == 1
-    if config.architecture == "patches":
-        shown = [garment_patches(garments[g], config.patch_spacing) for g, _, _ in (rows[:1] if shared else rows)]
-        weights = patch_layout(shown, config.geodesic_radius, config.geodesic_power, device)
-    elif not config.manifold_heads:
-        weights = torch.zeros((1, 0, 0), device=device)
-    elif garments[rows[0][0]].pools:
-        weights = pooled_weights(
-            [
-                (garments[g].pooled_geodesics, np.arange(first, len(garments[g].faces), face_splits))
-                for g, first, _ in (rows[:1] if shared else rows)
-            ],
-            config.geodesic_radius,
-            config.geodesic_power,
-            device,
-        )
-    elif shared:
-        weights = _weights(garments[rows[0][0]], rows[0][1], face_splits, config, device)[None]
-    else:
-        weights = torch.zeros((len(rows), faces, faces), device=device)
-        for r, (g, first, count) in enumerate(rows):
-            weights[r, :count, :count] = _weights(garments[g], first, face_splits, config, device)
-
+    shown: list[tuple[Any, np.ndarray | None]] = []
+    for g, first, _ in rows[:1] if shared else rows:
+        subset = None if face_splits == 1 else np.arange(first, len(garments[g].faces), face_splits)
+        shown.append((kind.geometry(garments[g], config), subset))
     return PaddedView(
         face_index=torch.from_numpy(face_index.clip(min=0)).to(device),
         face_mask=_mask(face_index, device),
         component_index=torch.from_numpy(component_index.clip(min=0)).to(device),
         component_mask=_mask(component_index, device),
-        weights=weights,
+        weights=kind.rows(shown, config, device),
         real_faces=_real(face_index, device),
         real_components=_real(component_index, device),
         share=torch.tensor([1.0 / min(face_splits, len(garments[g].faces)) for g, _, _ in rows], device=device),
         in_order=packed.count == 1 and face_splits == 1,
     )
-
-
-def _weights(
-    garment: Garment, first: int, face_splits: int, config: NetworkConfig, device: torch.device
-) -> torch.Tensor:
-    distances = np.ascontiguousarray(garment.geodesics[first::face_splits, first::face_splits])
-    return geodesic_weights(torch.from_numpy(distances).to(device), config.geodesic_radius, config.geodesic_power)
 
 
 def _mask(index: np.ndarray, device: torch.device) -> torch.Tensor | None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from warpgarment.nn.inputs import FrameInputs
+
 from .frame import Frame
 from .scene import Scene
 
@@ -13,11 +15,11 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     before = now.positions
     features = scene.features(before, now.body, next_body)
     stacked = now.history.stacked(features)
-    step = scene.predict(stacked, now.velocities)
+    step = scene.predict(FrameInputs(stacked, now.velocities, before, now.body, next_body))
     solved, finite = scene.reconstruct(before, step, features, next_body)
     origin = scene.contact.origin(before, features)
     pushed, finite, depth, report = scene.contact(solved, next_body, finite & now.finite, origin)
     after, finite, depth = scene.correct(before, pushed, next_body, finite, depth)
     history = now.history.followed(stacked, scene.centroids(after) - scene.centroids(before))
-    solves = torch.stack([scene.reconstruct.solver.summary(), report])
+    solves = torch.stack([scene.reconstruct.summary(), report])
     return Frame(after, next_body, history.features, history.velocities, finite, depth, solves)

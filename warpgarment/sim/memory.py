@@ -4,8 +4,9 @@
     print(memory)      # 1.3 GB: geodesic weights 805 MB, network 351 MB, ...
 
 What lasts (matrices over pairs of faces or vertices above all) is counted as it is laid out; what a frame needs in
-passing is the largest of its stages, by factors that were measured with torch's profiler. Predictions lie within a
-factor of 1.5 of what torch allocates, from 500 faces on. The CUDA context and libraries (some 0.5 GB) come on top.
+passing is the largest of its stages, by factors that were measured with torch's profiler. What the network needs is
+for its kind to say (`Architecture.memory`). Predictions lie within a factor of 1.5 of what torch allocates, from 500
+faces on. The CUDA context and libraries (some 0.5 GB) come on top.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ import numpy as np
 import torch
 
 from warpgarment.errors import NotEnoughMemory
-from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
 from warpgarment.kernels.collision.solver import compliance
 from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.kernels.linear import factor
+from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.rows import row_groups
+from warpgarment.nn.inputs import NetworkSizes
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies
@@ -33,19 +34,13 @@ from .stages.correct import Corrector
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes: rest frames, indices; sparse matrices and vectors of the solvers
-PER_PATCHED_FACE = 120  # bytes: the patches of a face with its shares in them, its neighbours
 PER_BODY_FACE, PER_BODY_VERTEX = 400, 60  # bytes: search tree with winding numbers; positions of two frames
 GRAPHED = 3  # copies of the history on a GPU: that of a state, and what a graph reads and writes
-MAKING_WEIGHTS = 2.3  # matrices besides the result while geodesic weights are made
 INVERTING = 3  # float64 matrices while the compliance of a component is made
-STACKS = (6.0, 4.0)  # copies of the stacked features, while they are prepared and while the network runs
-PATCH_STACKS = (1.0, 3.0)  # the same of a network of patches, for a single garment and for several
-TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps some more, of half the size
 LANES = 16  # rows of compliance matrices are padded to a multiple of it
 POISSON_FACTOR, COLLISION_FACTOR = 36.0, 85.0  # bytes for V log2 V of a component, for substitution
 EXPLICIT_FACTOR = 80.0  # bytes for V^1.5, inverted
 FACTOR_ENTRY = 12  # bytes
-BAG_ENTRY = 12  # bytes of an entry of a sparse matrix: a column and a weight
 MORE_SPLITS = (2, 4, 8, 16, 32, 64)
 
 
@@ -93,52 +88,22 @@ def predict(
     sizes = Sizes.of(garments, bodies)
     _, vertices, faces, body_vertices, body_faces = sizes
 
-    groups = row_groups(garments, config, face_splits)
-    patches = config.architecture == "patches"
-    width = config.face_embedding if patches else config.embedding
-    hidden = config.face_feed_forward if patches else config.feed_forward
-    weights, largest, network = 0, 0, 0
-    stack = 4 * config.history * FEATURES
-    stacks = STACKS
-    if patches:
-        stacks = (PATCH_STACKS[len(garments) > 1],) * 2
-    for group in groups:
-        length = max(count for _, _, count in group)
-        shared = len({(id(garments[g]), first) for g, first, _ in group}) == 1
-        rows = 1 if shared else len(group)
-        pooled = garments[group[0][0]].pools and not patches
-        if pooled and config.manifold_heads:
-            each = CENTRES**2
-            matrices = each * len({id(garments[g]) for g, _, _ in group})
-            weights += rows * length * (2 * NEAR * BAG_ENTRY + 12) + 8 * rows * CENTRES
-        else:
-            each = 0 if patches or not config.manifold_heads else length**2
-            matrices = rows * each
-            weights += rows * length * PER_PATCHED_FACE if patches else 0
-        weights += 4 * matrices
-        largest = max(largest, 4 * each)
-        inside = stacks[1] * stack + (2 * (TOKENS + 1.5) if half else 4 * TOKENS) * width
-        inside += 4 * max(0, 2 * hidden - 3 * width)
-        activations = len(group) * length * max(stacks[0] * stack, inside)
-        network = max(network, int(activations) + (2 * matrices if half and not pooled else 0))
-
+    shown = NetworkSizes(garments, face_splits, half, cpu)
+    network = dict(architecture(config.architecture).memory(shown, config))
     blocks, scratch, inverted = _compliance(garments)
     passing = {
-        "network": network,
+        "network": network.pop("network", 0),
         "collision forces": scratch,
-        "making weights": int(MAKING_WEIGHTS * largest),
+        "making weights": network.pop("making weights", 0),
         "inverting compliance": INVERTING * 8 * inverted,
     }
     peak = max(passing, key=lambda name: passing[name])
     return Memory(
         {
-            "geodesic weights": weights,
-            "geodesic distances": sum(4 * _distances(g) for g in unique)
-            if cpu and config.manifold_heads and not patches
-            else 0,
+            **network,
             "compliance of collisions": blocks,
             "factors of the solvers": _factors(unique, cpu),
-            "history of features": (1 if cpu else GRAPHED) * stack * faces,
+            "history of features": (1 if cpu else GRAPHED) * 4 * config.history * FEATURES * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
             "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
             peak: passing[peak],
@@ -201,12 +166,6 @@ def check(
         f"{len(garments):,} garments need {needed}. That is more than {_size(limit)}, {USABLE:.0%} of what is free on "
         f"{device}. {remedy}"
     )
-
-
-def _distances(garment: Garment) -> int:
-    """Numbers that geodesic weights are made from: of each pair, or between the centres of pools and to them."""
-    count = len(garment.faces)
-    return CENTRES**2 + 2 * NEAR * count if garment.pools else count**2
 
 
 def _factors(garments: Sequence[Garment], cpu: bool) -> int:

@@ -16,9 +16,9 @@ from warpgarment.errors import MeshError
 from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
+from warpgarment.nn.inputs import FrameInputs, VertexStep
 from warpgarment.nn.network import GarmentNetwork
-from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context
-from warpgarment.nn.rows import padded_views
+from warpgarment.nn.parametrisation import Step
 from warpgarment.objects.clearance import clearance
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies, PackedGarments
@@ -45,7 +45,7 @@ class Scene:
         body_vertices: Bodies in the first frame [m], packed, shape [U,3].
         first_vertices: Garments in the first frame [m], packed, shape [V,3].
         network: Reads its config; run by `predict`.
-        face_splits: As `padded_views`.
+        face_splits: As in `GarmentNetwork.layout`.
         epsilon: Distance that collision refinement keeps from the body [m]; None: see `clearance`.
         collision_passes: Largest number of refinements in a frame.
         half: Whether the transformer runs in bfloat16.
@@ -59,6 +59,7 @@ class Scene:
     Raises:
         MeshError: A garment is more than 1 m from its body.
         NotEnoughMemory: The batch would not fit on the device.
+        ValueError: The network reads what a simulation does not know yet.
     """
 
     def __init__(
@@ -77,6 +78,8 @@ class Scene:
         contact_sources: Sequence[ContactSource] = (BodyContacts(),),
         correctors: Sequence[Corrector] = (),
     ) -> None:
+        if network.reads:
+            raise ValueError(f"the network reads {', '.join(sorted(network.reads))}, which simulations do not give yet")
         device = body_vertices.device
         self.garments, self.network, self.timings, self.half = list(garments), network, timings, half
         self.contact_sources, self.correctors = list(contact_sources), list(correctors)
@@ -95,7 +98,7 @@ class Scene:
         body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
         body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
         self._refuse_far(first_vertices, body_of_vertex)
-        self.views = padded_views(packed, garments, network.config, face_splits)
+        self.layout = network.layout(garments, packed, face_splits=face_splits)
 
         margins = [clearance(garment) if epsilon is None else epsilon for garment in garments]
         self.centroids = ComponentCentroids(packed)
@@ -136,29 +139,10 @@ class Scene:
                     "wg.fit."
                 )
 
-    def predict(self, stacked: torch.Tensor, velocities: torch.Tensor) -> Step:
-        """The network, step 2: stacked features [F,H,34] and velocities [C,H-1,3] -> what happens next."""
-        faces, components = len(stacked), len(velocities)
-        stacked, velocities = stacked.flatten(1), velocities.flatten(1)
-        output = NetworkOutput(
-            stacked.new_empty((faces, 3, 3)), stacked.new_empty((faces, 3)), stacked.new_zeros((components, 3))
-        )
-        training = self.network.training
-        self.network.eval()
-        device = stacked.device.type
-        with self.timings("network"), torch.autocast(device, torch.bfloat16, enabled=self.half):
-            for view in self.views:
-                rows = self.network(
-                    view.faces(stacked),
-                    view.components(velocities),
-                    view.weights,
-                    face_mask=view.face_mask,
-                    velocity_mask=view.component_mask,
-                )
-                view.add_to(output, rows)
-        self.network.train(training)
-        newest = context(stacked, self.packed.face_component, components)
-        return compose(output, newest, residual=self.network.config.residual)
+    def predict(self, inputs: FrameInputs) -> Step | VertexStep:
+        """The network, step 2: what happens next."""
+        with self.timings("network"):
+            return self.network.predict(inputs, self.layout, bfloat16=self.half)
 
 
 def _lengths(offsets: Sequence[int]) -> list[int]:

@@ -19,6 +19,7 @@ from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.nn import checkpoint
 from warpgarment.nn.network import GarmentNetwork
+from warpgarment.nn.run import evaluating
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
@@ -187,10 +188,11 @@ class Simulator:
         states = self._begin(garments, single, packed, known, first, face_splits)
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
-        for frame in counted(range(total), progress):
-            state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
-            if not recording.add(state.now.outcome, last=frame == total - 1):
-                break
+        with evaluating(self.network):
+            for frame in counted(range(total), progress):
+                state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
+                if not recording.add(state.now.outcome, last=frame == total - 1):
+                    break
         results = []
         for i, (worn, statuses) in enumerate(zip(garments, recording.statuses, strict=True)):
             if not statuses[-1].finite:
@@ -281,7 +283,8 @@ class Simulator:
             raise ValueError(f"bodies had {len(state.now.body)} vertices at the start, now there are {len(body)}")
         if not all(np.isfinite(array).all() for array in arrays):
             raise MeshError(f"body_vertices of frame {state.frame + 1} hold NaN or infinity; skip or repair the frame")
-        return self._advance(state, body)
+        with evaluating(self.network):
+            return self._advance(state, body)
 
     @torch.inference_mode()
     def _begin(

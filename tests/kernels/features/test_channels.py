@@ -129,8 +129,8 @@ def test_parts_of_a_table():
     names = ("signed_distance", "normal")
     part = FACE.only(names)
     assert (part.width, part.names, part.slices) == (4, names, {"signed_distance": slice(0, 1), "normal": slice(1, 4)})
-    rows = torch.arange(2.0 * FACE.width).reshape(2, -1)
-    assert FACE.take(rows, names).tolist() == [[15.0, 9.0, 10.0, 11.0], [49.0, 43.0, 44.0, 45.0]]
+    rows = torch.arange(FACE.width) + 100.0 * torch.arange(2)[:, None]
+    assert FACE.take(rows, names).tolist() == [[15.0, 9.0, 10.0, 11.0], [115.0, 109.0, 110.0, 111.0]]
     assert FACE.take(rows, FACE.names) is rows
     with pytest.raises(ValueError, match="no feature channel 'colour'; there are deformation_gradient, normal, "):
         FACE.only(("colour",))

@@ -8,10 +8,11 @@ from support import sequences as synthetic_sequences
 from support.runs import config_for
 
 from warpgarment.nn import checkpoint
+from warpgarment.nn.architecture import GrowthError, build_network
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.grow import GrowthError, grow
-from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
+from warpgarment.nn.faces.grow import grow
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.samples.pushforward import PushforwardConfig
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.start import train

@@ -14,10 +14,10 @@ from warpgarment.kernels.features.face import body_interaction, face_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn import heading
 from warpgarment.nn.attention import EncoderLayer, ManifoldAwareAttention, geodesic_weights
-from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.config import STATISTICS, NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.nn.network import STATISTICS, rotate_output
 from warpgarment.nn.parametrisation import NetworkOutput
+from warpgarment.nn.run import rotate_output
 
 TINY = {"embedding": 24, "layers": 2, "feed_forward": 32, "heads": 3, "manifold_heads": 1, "history": 3}
 
@@ -303,7 +303,7 @@ def test_normalisation_goes_there_and_back():
     for a, b in zip(network.denormalise(network.normalise_targets(output)), output, strict=True):
         close(a, b, 1e-5)
     features, velocities, _ = inputs(2, 5, 1)
-    x, v = network.encode(features, velocities)
+    x, v = network.encode(features), network.encode_velocities(velocities)
     mean, std = network.feature_mean.double().numpy(), network.feature_std.double().numpy()
     expected = (features.double().numpy().reshape(2, 5, 3, FEATURES) - mean) / std
     close(x, expected.reshape(2, 5, -1), 1e-4)

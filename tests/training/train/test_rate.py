@@ -9,8 +9,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces import ARCHITECTURE
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
-from warpgarment.nn.flops import forward_flops, peak_of, step_flops
+from warpgarment.nn.flops import peak_of, step_flops
 from warpgarment.training.train.rate import Rate, spelt
 
 
@@ -29,7 +30,7 @@ def test_operations_are_those_pytorch_counts(changes):
             output = network.forward_normalised(x, v, weights)
         with FlopCounterMode(display=False) as backward:
             sum(part.sum() for part in output).backward()
-    assert samples * sum(forward_flops(config, faces, components)) == forward.get_total_flops()
+    assert samples * sum(ARCHITECTURE.flops(config, faces, components, weights)) == forward.get_total_flops()
     assert step_flops(config, samples, faces, components) == forward.get_total_flops() + backward.get_total_flops()
 
 

@@ -16,8 +16,9 @@ from support.runs import config_for, entries_of, losses_of
 from warpgarment.kernels.features import LAYOUT
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
+from warpgarment.nn.architecture import build_network
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.faces.network import ManifoldAwareTransformer, build_network
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.sim.simulator import Simulator
 from warpgarment.sim.stages import features
 from warpgarment.training.data.sequence import Sequence

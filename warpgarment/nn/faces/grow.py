@@ -3,7 +3,7 @@
     warpgarment train --network base --overrides ... --init small.safetensors --grow ...
 
 Widening and deepening without a change of the function (Chen, Goodfellow and Shlens 2016, "Net2Net"), for the pre-norm
-encoder of `network.py`:
+encoder of network.py:
 
 - The residual stream is repeated: channel j of the large network holds channel j mod E of the small one. What writes
   into it has its rows repeated; what reads it shares each weight unevenly among the copies, so that they part ways in
@@ -23,18 +23,15 @@ from typing import cast
 import torch
 from torch import nn
 
+from warpgarment.nn.architecture import GrowthError
 from warpgarment.nn.attention import EncoderLayer
-from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.network import STATISTICS, GarmentNetwork
+from warpgarment.nn.config import STATISTICS, NetworkConfig
+from warpgarment.nn.network import GarmentNetwork
 
 from .network import ManifoldAwareTransformer
 
 MAY_DIFFER = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "dropout")
 UNEVEN = 0.5  # how far the shares of the copies of a channel are from equal
-
-
-class GrowthError(ValueError):
-    """A network that cannot be grown to the shape wanted; says what is in the way."""
 
 
 def grow(small: GarmentNetwork, config: NetworkConfig, *, seed: int = 0) -> ManifoldAwareTransformer:

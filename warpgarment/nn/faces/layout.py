@@ -63,6 +63,11 @@ class PooledWeights(NamedTuple):
     collect: Bags  # its transpose
     scale: torch.Tensor  # [R,N], 1/s; 0 where padded
 
+    @property
+    def faces(self) -> int:
+        """Number of faces N of a row."""
+        return self.scale.shape[1]
+
     def to(self, dtype: torch.dtype) -> PooledWeights:
         """Itself: sums over thousands of centres stay in the precision they were made in."""
         return self
@@ -129,6 +134,39 @@ def pooled_weights(
     for mask, (_, subset) in zip(real, rows, strict=True):
         mask[: len(subset)] = 1.0
     return result._replace(scale=real / result.spread(real[..., None])[..., 0].where(real > 0, 1.0))
+
+
+class Sampled(NamedTuple):
+    """One garment's geodesics as training keeps them on the device, to draw weights of many subsets of faces from."""
+
+    # exp(-(D/r)^p), float16 [F,F], of which weights of a subset are rows, divided by their sums; or pooled distances
+    geodesics: torch.Tensor | PooledGeodesics
+    radius: float
+    power: float
+    device: torch.device
+
+    @property
+    def faces(self) -> int:
+        """Number of faces F."""
+        return len(self.geodesics) if isinstance(self.geodesics, torch.Tensor) else self.geodesics.faces
+
+    def weights(self, faces: np.ndarray, scale: float = 1.0) -> torch.Tensor:
+        """Weights of some faces [n] of the garment made `scale` times as large, float32 [n,n]."""
+        if not isinstance(self.geodesics, torch.Tensor):
+            return dense_weights(self.geodesics, faces, self.radius / scale, self.power, self.device)
+        chosen = torch.from_numpy(faces).to(self.device)
+        kernel = self.geodesics[chosen[:, None], chosen[None, :]].float()
+        if scale != 1.0:  # exp(-(s D/r)^p) = exp(-(D/r)^p)^(s^p)
+            kernel = kernel ** float(scale**self.power)
+        return kernel / kernel.sum(dim=1, keepdim=True)
+
+
+def sampled(geometry: np.ndarray | PooledGeodesics, radius: float, power: float, device: torch.device) -> Sampled:
+    """From geodesic distances between all faces [m], float32 [F,F], or from pooled ones."""
+    if isinstance(geometry, PooledGeodesics):
+        return Sampled(geometry, radius, power, device)
+    kernel = torch.exp(-((torch.from_numpy(np.array(geometry)) / radius) ** power))
+    return Sampled(kernel.to(device=device, dtype=torch.float16), radius, power, device)
 
 
 def dense_weights(

@@ -4,7 +4,7 @@
                                                      +-> encoder layers -----+
     velocities [C, (H-1)*3]  -> linear -> C tokens --+   (attention.py)      +-> linear -> q (3) per component
 
-History is oldest first: feature k of frame h is number h*34 + k, and h = H-1 is the newest. There is no positional
+History is oldest first: feature k of K in frame h is number h*K + k, and h = H-1 is the newest. There is no positional
 encoding: where a face lies is among its features. What it shares with other networks is in `nn/network.py`.
 """
 
@@ -13,32 +13,11 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.network import STATISTICS, GarmentNetwork, NormalisedOutput, rotate_output
-from warpgarment.nn.parametrisation import NetworkOutput
-from warpgarment.nn.patches.network import PatchTransformer
+from warpgarment.nn.inputs import NormalisedOutput
+from warpgarment.nn.network import GarmentNetwork
 
 from .layout import PooledWeights
-
-__all__ = [
-    "STATISTICS",
-    "GarmentNetwork",
-    "ManifoldAwareTransformer",
-    "NetworkConfig",
-    "NetworkOutput",
-    "NormalisedOutput",
-    "PatchTransformer",
-    "build_network",
-    "geodesic_weights",
-    "rotate_output",
-]
-
-
-def build_network(config: NetworkConfig) -> GarmentNetwork:
-    """An untrained network of the kind that `config.architecture` names."""
-    kinds = {"faces": ManifoldAwareTransformer, "patches": PatchTransformer}
-    return kinds[config.architecture](config)
 
 
 class ManifoldAwareTransformer(GarmentNetwork):
@@ -62,27 +41,27 @@ class ManifoldAwareTransformer(GarmentNetwork):
         self,
         x: torch.Tensor,
         v: torch.Tensor,
-        weights: torch.Tensor | PooledWeights,
+        rows: torch.Tensor | PooledWeights,
         *,
         face_mask: torch.Tensor | None = None,
-        velocity_mask: torch.Tensor | None = None,
+        component_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
-        """The transformer itself: normalised inputs to normalised outputs, shapes as in `forward`."""
+        """The transformer itself; `rows` are geodesic weights, zero in padded columns."""
         key_mask = None
-        if face_mask is not None or velocity_mask is not None:
+        if face_mask is not None or component_mask is not None:
             if face_mask is None:
                 face_mask = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
-            if velocity_mask is None:
-                velocity_mask = torch.ones(v.shape[:2], dtype=torch.bool, device=x.device)
+            if component_mask is None:
+                component_mask = torch.ones(v.shape[:2], dtype=torch.bool, device=x.device)
             x = torch.where(face_mask[..., None], x, 0.0)  # whatever padding holds, NaN too, must not spread
-            v = torch.where(velocity_mask[..., None], v, 0.0)
-            key_mask = torch.cat([face_mask, velocity_mask], dim=1)[:, None, None, :]
+            v = torch.where(component_mask[..., None], v, 0.0)
+            key_mask = torch.cat([face_mask, component_mask], dim=1)[:, None, None, :]
         faces, kind = x.shape[1], x.device.type
         half = torch.is_autocast_enabled(kind)
         with torch.autocast(kind, enabled=False):  # velocities are differences of frames that bfloat16 would round away
             tokens = torch.cat([self.embed_faces(x), self.embed_velocity(v)], dim=1)
         # once, instead of in every layer where autocast runs in half
-        weights = weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
+        weights = rows.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
         for layer in self.layers:
             tokens = layer(tokens, weights, key_mask)
         with torch.autocast(kind, enabled=False):

@@ -69,7 +69,7 @@ class PatchLayout(NamedTuple):
 
 
 def garment_patches(garment: Garment, spacing: float) -> Patches:
-    """The patches of a garment, computed the first time they are asked for.
+    """The patches of a garment, computed the first time, from its geodesic distances where these are there already.
 
     Args:
         garment: Any.
@@ -77,11 +77,17 @@ def garment_patches(garment: Garment, spacing: float) -> Patches:
     """
     mine = _known.setdefault(garment, {})
     if spacing not in mine:
-        graph, count = surface_graph(garment.vertices, garment.faces), len(garment.faces)
-        mine[spacing] = patches(
-            garment.vertices, garment.faces, spacing, lambda face: distances_from(graph, np.array([face]), count)[0]
-        )
+        mine[spacing] = patches(garment.vertices, garment.faces, spacing, _distances(garment))
     return mine[spacing]
+
+
+def _distances(garment: Garment) -> Callable[[int], np.ndarray]:
+    """Geodesic distances from a face to all: a row of those that are there already, or else a search."""
+    known = garment.__dict__.get("geodesics")  # a cached property
+    if known is not None:
+        return known.__getitem__
+    graph, count = surface_graph(garment.vertices, garment.faces), len(garment.faces)
+    return lambda face: distances_from(graph, np.array([face]), count)[0]
 
 
 def patches(vertices: np.ndarray, faces: np.ndarray, spacing: float, distances: Callable[[int], np.ndarray]) -> Patches:

@@ -20,11 +20,10 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from warpgarment.nn import heading
 from warpgarment.nn.attention import ACTIVATIONS
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.network import GarmentNetwork, NormalisedOutput, rotate_output
-from warpgarment.nn.parametrisation import NetworkOutput
+from warpgarment.nn.inputs import NormalisedOutput
+from warpgarment.nn.network import GarmentNetwork
 
 from .layout import PatchLayout
 
@@ -128,42 +127,19 @@ class PatchTransformer(GarmentNetwork):
         config = self.config
         return FaceLayer(config.face_embedding, config.face_feed_forward, config.activation, hears)
 
-    def forward(
-        self,
-        face_features: torch.Tensor,
-        velocities: torch.Tensor,
-        weights: PatchLayout,
-        *,
-        face_mask: torch.Tensor | None = None,
-        velocity_mask: torch.Tensor | None = None,
-    ) -> NetworkOutput:
-        """As in `GarmentNetwork`, with the turn and the normalisation of the features done to the first weights."""
-        kind = face_features.device.type
-        half = torch.is_autocast_enabled(kind)
-        with torch.autocast(kind, enabled=False):  # half precision is for the transformer, not for positions
-            frame = None
-            if self.config.heading == "canonical":
-                frame = heading.canonical_frame(face_features, face_mask)
-                velocities = heading.rotate_vectors(velocities, frame)
-            if face_mask is not None:
-                face_features = torch.where(face_mask[..., None], face_features, 0.0)
-            faces = self._embedded(self.read(face_features), frame)
-            tokens = self.embed_velocity(self._without_padding(self.encode_velocities(velocities), velocity_mask))
-        with torch.autocast(kind, dtype=torch.get_autocast_dtype(kind), enabled=half):
-            normalised = self._from_embeddings(faces, tokens, weights, velocity_mask)
-        with torch.autocast(kind, enabled=False):
-            return rotate_output(self.denormalise(normalised), frame, inverse=True)
-
-    def _embedded(self, face_features: torch.Tensor, frame: torch.Tensor | None) -> torch.Tensor:
+    def embedded(
+        self, face_features: torch.Tensor, turn: torch.Tensor | None, face_mask: torch.Tensor | None
+    ) -> torch.Tensor:
         """What `embed_faces` makes of turned and normalised features, from those as they are.
 
         W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
         """
+        face_features = self.read(self._without_padding(face_features, face_mask))
         scaled = self.embed_faces.weight.unflatten(1, (-1, self.channels.width)) / self.feature_std  # [E,H,K]
         bias = self.embed_faces.bias - scaled.sum(dim=1) @ self.feature_mean
-        if frame is None:
+        if turn is None:
             return F.linear(face_features, scaled.flatten(1), bias)
-        turned = torch.einsum("ehi,bij->behj", scaled, self.channels.turn(frame)).flatten(2)
+        turned = torch.einsum("ehi,bij->behj", scaled, self.channels.turn(turn)).flatten(2)
         if len(turned) == 1:
             return F.linear(face_features, turned[0], bias)
         return torch.baddbmm(bias, face_features, turned.mT)
@@ -172,16 +148,29 @@ class PatchTransformer(GarmentNetwork):
         self,
         x: torch.Tensor,
         v: torch.Tensor,
-        weights: PatchLayout,
+        rows: PatchLayout,
         *,
         face_mask: torch.Tensor | None = None,
-        velocity_mask: torch.Tensor | None = None,
+        component_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
-        """The network itself: normalised inputs to normalised outputs, shapes as in `forward`."""
-        x, v = self._without_padding(x, face_mask), self._without_padding(v, velocity_mask)
+        """The network itself; `rows` say how faces lie in patches."""
         with torch.autocast(x.device.type, enabled=False):  # differences of frames, which bfloat16 would round away
-            faces, tokens = self.embed_faces(x), self.embed_velocity(v)
-        return self._from_embeddings(faces, tokens, weights, velocity_mask)
+            faces = self.embed_faces(self._without_padding(x, face_mask))
+        return self.forward_embedded(faces, v, rows, face_mask=face_mask, component_mask=component_mask)
+
+    def forward_embedded(
+        self,
+        embedded: torch.Tensor,
+        v: torch.Tensor,
+        rows: PatchLayout,
+        *,
+        face_mask: torch.Tensor | None = None,
+        component_mask: torch.Tensor | None = None,
+    ) -> NormalisedOutput:
+        """The same from embedded faces [R,N,F]."""
+        with torch.autocast(v.device.type, enabled=False):
+            tokens = self.embed_velocity(self._without_padding(v, component_mask))
+        return self._from_embeddings(embedded, tokens, rows, component_mask)
 
     @staticmethod
     def _without_padding(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:

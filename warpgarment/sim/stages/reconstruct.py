@@ -12,6 +12,7 @@ from warpgarment.kernels.deformation.svd import replace_singular_values
 from warpgarment.kernels.features.face import LAYOUT
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.nn.inputs import VertexStep
 from warpgarment.nn.parametrisation import Step
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
@@ -52,6 +53,7 @@ class Reconstruct:
         timings: Timings,
     ) -> None:
         self._packed, self._centroids, self._replace, self._timings = packed, centroids, replace, timings
+        self._device, self._solved = packed.faces.device, False
         pinned = len(packed.pins) > 0
         self.solver = PoissonSolver(packed.rest_vertices, packed.faces, pins=packed.pins if pinned else None)
         self._pins: BodyPins | None = None
@@ -62,7 +64,7 @@ class Reconstruct:
             self._mean_response = torch.from_numpy(np.concatenate(responses)).to(packed.faces.device)[:, None]
 
     def __call__(
-        self, vertices: torch.Tensor, step: Step, features: torch.Tensor, next_body: torch.Tensor
+        self, vertices: torch.Tensor, step: Step | VertexStep, features: torch.Tensor, next_body: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions at t+1 before contact. Differentiable in positions, prediction and features.
 
@@ -75,6 +77,13 @@ class Reconstruct:
         Returns:
             Positions [m], shape [V,3], and which garments are finite, bool [B]; the others are where they were.
         """
+        self._solved = not isinstance(step, VertexStep)
+        if isinstance(step, VertexStep):  # positions are given: they only meet the pins
+            positions = step.positions
+            if self._pins is not None:
+                positions = positions.index_copy(0, self._packed.pins.long(), self._pins.targets(next_body))
+            every = torch.ones(self._packed.count, dtype=torch.bool, device=vertices.device)
+            return keep_finite(self._packed, positions, vertices, every)
         with self._timings("singular values"):
             target, finite = self.gradients(step, features)
         with self._timings("poisson"):
@@ -92,6 +101,10 @@ class Reconstruct:
                 missing = PINNED_MEAN * missing[of_vertex]
                 solved = solved + self._mean_response * missing
         return keep_finite(self._packed, solved, vertices, finite)
+
+    def summary(self) -> torch.Tensor:
+        """The report of the last Poisson solve, float64 [3] on the device; zeros where none was needed."""
+        return self.solver.summary() if self._solved else torch.zeros(3, dtype=torch.float64, device=self._device)
 
     def gradients(self, step: Step, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Deformation gradients at t+1 [F,3,3], and whose prediction is finite [B]; see `next_gradients`.

@@ -1,0 +1,145 @@
+"""Networks that say where vertices are: the simulator takes their positions as the next frame before contact."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+from support.scenes import TINY, body, nowhere_deeper, skirt, walk
+
+from warpgarment.kernels.poisson.solver import PoissonSolver
+from warpgarment.nn.architecture import ARCHITECTURES, Architecture
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.inputs import VertexStep
+from warpgarment.nn.network import GarmentNetwork
+from warpgarment.sim.simulator import Simulator
+
+SPEED = torch.tensor([0.003, -0.004, 0.002])  # metres a frame
+
+
+class Drift(GarmentNetwork):
+    """Every vertex moves on at the same speed, and with the mean of the body."""
+
+    def layout(self, garments, packed, *, face_splits=1):
+        return len(garments)
+
+    def predict(self, inputs, layout, *, bfloat16=False):
+        return VertexStep(inputs.vertices + SPEED + (inputs.next_body - inputs.body).mean(dim=0))
+
+
+class DriftArchitecture(Architecture):
+    config, presets, subsets = NetworkConfig, {}, False
+
+    def build(self, config):
+        return Drift(config)
+
+    def memory(self, sizes, config):
+        return {"network": 0}
+
+    def flops(self, config, faces, components, rows):
+        return 0, 0
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    """The kind has a name for as long as a test."""
+    module = types.ModuleType("drift")
+    module.ARCHITECTURE = DriftArchitecture()
+    monkeypatch.setitem(sys.modules, "drift", module)
+    monkeypatch.setitem(ARCHITECTURES, "drift", "drift")
+
+
+def drift(kind=Drift) -> GarmentNetwork:
+    """An instance."""
+    return kind(NetworkConfig(architecture="drift", **TINY))
+
+
+def test_positions_are_the_next_frame(monkeypatch):
+    """A network's positions would go through the Poisson system, which bends them. Sums of float32 alone, 1e-6 m."""
+    monkeypatch.setattr(PoissonSolver, "solve", lambda *_, **__: pytest.fail("a Poisson system is solved"))
+    garments, motion = [skirt(), skirt()], walk(6)
+    results = Simulator(drift(), "cpu", collision_passes=0).rollout(garments, motion)
+    for result in results:
+        moved = motion.vertices.mean(axis=1) - motion.vertices[0].mean(axis=0)
+        expected = skirt().vertices + moved[:, None] + np.arange(6)[:, None, None] * SPEED.numpy()
+        assert np.abs(result.vertices - expected).max() < 1e-6
+        assert all(status.finite for status in result.status)
+
+
+def test_steps_are_the_rollout():
+    """`step` would treat such networks otherwise than `rollout`. Bit for bit."""
+    motion, simulator = walk(4), Simulator(drift(), "cpu")
+    whole = simulator.rollout(skirt(), motion).vertices
+    state = simulator.start(skirt(), motion.vertices[0], motion.faces)
+    for frame in range(1, 4):
+        state = simulator.step(state, motion.vertices[frame])
+        np.testing.assert_array_equal(state.vertices, whole[frame])
+
+
+def test_collisions_are_refined():
+    """A network's positions would be left inside the body."""
+
+    class Squeeze(Drift):
+        def predict(self, inputs, layout, *, bfloat16=False):
+            return VertexStep(inputs.vertices * torch.tensor([0.5, 1.0, 0.5]))
+
+    motion = body(2)
+    loose = Simulator(drift(Squeeze), "cpu", collision_passes=0).rollout(skirt(), motion).vertices[-1]
+    kept = Simulator(drift(Squeeze), "cpu").rollout(skirt(), motion).vertices[-1]
+    assert nowhere_deeper(loose, motion, 1) > 0.01
+    assert nowhere_deeper(kept, motion, 1) < 1e-3
+
+
+def test_pins_stay_on_the_body():
+    """Pinned vertices would leave the body with the network. Here it stands still; 1e-6 m."""
+    worn = skirt(pins=np.arange(16, dtype=np.int32))
+    result = Simulator(drift(), "cpu", collision_passes=0).rollout(worn, body(4)).vertices
+    assert np.abs(result[:, :16] - worn.vertices[:16]).max() < 1e-6
+    assert np.abs(result[-1, 16:] - worn.vertices[16:] - 3 * SPEED.numpy()).max() < 1e-6
+
+
+def test_positions_that_are_not_finite():
+    """NaN of one garment would spread, or not be reported."""
+
+    class Broken(Drift):
+        def predict(self, inputs, layout, *, bfloat16=False):
+            positions = super().predict(inputs, layout).positions.clone()
+            positions[0] = torch.nan
+            return VertexStep(positions)
+
+    with pytest.warns(RuntimeWarning, match="skirt stopped"):
+        broken, sound = Simulator(drift(Broken), "cpu").rollout([skirt(), skirt()], walk(3))
+    assert not broken.status[-1].finite
+    assert sound.status[-1].finite
+    assert np.isfinite(sound.vertices).all()
+
+
+def test_a_network_that_reads_more_than_there_is():
+    """It would be given None, and fail somewhere inside or learn nothing of it."""
+
+    class Windy(Drift):
+        reads = frozenset({"wind", "materials"})
+
+    with pytest.raises(ValueError, match="reads materials, wind, which simulations do not give yet"):
+        Simulator(drift(Windy), "cpu").rollout(skirt(), walk(2))
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_mode_is_as_it_was(training):
+    """A rollout during training would leave dropout switched off, or on while it runs."""
+    seen = []
+
+    class Watched(Drift):
+        def predict(self, inputs, layout, *, bfloat16=False):
+            seen.append(self.training)
+            return super().predict(inputs, layout)
+
+    network = drift(Watched).train(training)
+    simulator, motion = Simulator(network, "cpu"), walk(3)
+    simulator.rollout(skirt(), motion)
+    simulator.step(simulator.start(skirt(), motion.vertices[0], motion.faces), motion.vertices[1])
+    assert seen == [False] * 3
+    assert network.training == training

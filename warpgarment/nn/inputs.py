@@ -1,0 +1,65 @@
+"""What networks are given and what they answer, in a simulation and row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+
+if TYPE_CHECKING:
+    from warpgarment.objects.garment import Garment
+
+
+class FrameInputs(NamedTuple):
+    """A packed batch of F faces, V vertices and C connected components at frame t, in physical units and world space.
+
+    The last four are None unless the network `reads` them.
+    """
+
+    features: torch.Tensor  # [F,H,K] oldest first, all channels of kernels/features/channels.py
+    velocities: torch.Tensor  # [C,H-1,3] of components, oldest first [m/frame]
+    vertices: torch.Tensor  # [V,3] frame t [m]
+    body: torch.Tensor  # [U,3] frame t [m]
+    next_body: torch.Tensor  # [U,3] frame t+1 [m]
+    previous: torch.Tensor | None = None  # [V,3] frame t-1 [m]
+    materials: torch.Tensor | None = None  # [B,M] fields of `Material` in their order
+    wind: torch.Tensor | None = None  # [B,3] m/s
+    pairs: torch.Tensor | None = None  # int32 [P,2] vertices of different garments that are near each other
+
+
+class VertexStep(NamedTuple):
+    """What a network answers that moves vertices itself; `parametrisation.Step` is the answer by faces."""
+
+    positions: torch.Tensor  # [V,3] the next frame before contact [m]; no Poisson system is solved
+
+
+class RowInputs(NamedTuple):
+    """R rows of at most N faces and C components, each row a garment or a part of its faces, in physical units."""
+
+    features: torch.Tensor  # [R,N,H*K] oldest first, all channels
+    velocities: torch.Tensor  # [R,C,(H-1)*3] m/frame
+    rows: Any  # of `Architecture.rows`
+    face_mask: torch.Tensor | None = None  # bool [R,N], True where a face is real; None where all are
+    component_mask: torch.Tensor | None = None  # bool [R,C]
+    turn: torch.Tensor | None = None  # [R,3,3] of the world, on top of what the network's heading asks for; None: none
+    rest_turn: torch.Tensor | None = None  # [R,3,3] of the rest pose
+    mirrored: torch.Tensor | None = None  # bool [R], which rows are mirrored in x, after the turns
+    in_network_frame: bool = False  # turned and mirrored already, and so is the target
+
+
+class NormalisedOutput(NamedTuple):
+    """Output of the network, or a target for it, in units of zero mean and unit variance."""
+
+    psi: torch.Tensor  # [R,N,9]
+    singular_values: torch.Tensor  # [R,N,3]
+    velocity: torch.Tensor  # [R,C,3]
+
+
+class NetworkSizes(NamedTuple):
+    """A simulation whose memory is to be predicted."""
+
+    garments: Sequence[Garment]  # one that occurs several times shares what is constant
+    face_splits: int = 1
+    half: bool = False  # bfloat16
+    cpu: bool = True

@@ -1,0 +1,98 @@
+"""What the program asks of networks of patches, see `nn.architecture.Architecture`.
+
+Operations, with the symbols of `nn/flops.py`: a network of patches has P of them, F face width, G width of a face
+layer, K face layers; its encoder layers are those on P + C tokens, and around them are
+
+    embedding        2 N (34 H) F + 2 C 3 (H - 1) E
+    face layers      (K + 1) 4 N F G + K 2 N F G      pooling and spreading, a few operations a number, are not counted
+    patches          4 P F E + 2 C P F + 2 C F E      to their width and back, and the mean of each component
+    heads            2 N F 12 + 2 C E 3
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from warpgarment.kernels.features.channels import FEATURES
+from warpgarment.nn.architecture import Architecture, GrowthError
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.network import ManifoldAwareTransformer
+from warpgarment.nn.flops import layer_flops
+from warpgarment.nn.inputs import NetworkSizes
+from warpgarment.nn.network import GarmentNetwork
+from warpgarment.nn.rows import activation_bytes, row_groups
+from warpgarment.objects.garment import Garment
+
+from .layout import Patches, PatchLayout, garment_patches, patch_layout
+from .network import PatchTransformer
+
+PER_PATCHED_FACE = 120  # bytes: the patches of a face with its shares in them, its neighbours
+STACKS = (1.0, 3.0)  # copies of the stacked features at a time, for a single garment and for several
+PRESETS = {"fast": NetworkConfig.fast()}
+
+
+class PatchesOfCloth(Architecture):
+    """Faces pooled into patches; rows are a `PatchLayout`."""
+
+    config = NetworkConfig
+    presets = PRESETS
+    subsets = False  # faces hear their neighbours across the edges
+
+    def build(self, config: NetworkConfig) -> GarmentNetwork:
+        """An untrained `PatchTransformer`."""
+        return PatchTransformer(config)
+
+    def geometry(self, garment: Garment, config: NetworkConfig) -> Patches:
+        """The garment's patches."""
+        return garment_patches(garment, config.patch_spacing)
+
+    def rows(
+        self,
+        shown: Sequence[tuple[Patches, np.ndarray | None]],
+        config: NetworkConfig,
+        device: torch.device,
+        scale: Sequence[float] | np.ndarray | None = None,
+    ) -> PatchLayout:
+        """The patches of some garments, padded."""
+        patches = [whole if faces is None else whole.subset(faces) for whole, faces in shown]
+        return patch_layout(patches, config.geodesic_radius, config.geodesic_power, device, scale)
+
+    def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
+        """The patches of all faces, and a call of the network."""
+        garments, stack = sizes.garments, 4 * config.history * FEATURES
+        stacks = (STACKS[len(garments) > 1],) * 2
+        layouts, network = 0, 0
+        for group in row_groups(garments, config, 1):
+            length = max(count for _, _, count in group)
+            shared = len({id(garments[g]) for g, _, _ in group}) == 1
+            layouts += length * PER_PATCHED_FACE * (1 if shared else len(group))
+            widths = config.face_embedding, config.face_feed_forward
+            network = max(network, activation_bytes(len(group) * length, stack, stacks, *widths, sizes.half))
+        return {"geodesic weights": layouts, "network": network}
+
+    def flops(self, config: NetworkConfig, faces: int, components: int, rows: PatchLayout) -> tuple[int, int]:
+        """See above."""
+        e, width, patches = config.embedding, config.face_embedding, rows.start.shape[1]
+        embedding = 2 * (width * faces * config.history * config.features + e * components * 3 * (config.history - 1))
+        layers, geodesic = layer_flops(config, patches, components)
+        layers += (6 * config.face_layers + 4) * faces * width * config.face_feed_forward + 4 * patches * width * e
+        layers += 2 * components * width * (patches + e)
+        return layers + 2 * (width * 12 * faces + e * 3 * components), embedding + geodesic
+
+    def start_from(
+        self, network: GarmentNetwork, config: NetworkConfig, *, grow: bool, seed: int = 0
+    ) -> GarmentNetwork:
+        """From a network of faces as `PatchTransformer.from_faces` does; from any other, that one in its own shape."""
+        if grow:
+            raise GrowthError(
+                f"only networks of faces can be grown, and to a shape of faces; this shape has "
+                f"architecture={config.architecture!r}, whose layers of faces have no rule for a larger one. Leave out "
+                "grow to train a network further in its own shape, or grow a network of faces and start one of patches "
+                "from that: init without grow, for a shape of patches with its widths"
+            )
+        if isinstance(network, ManifoldAwareTransformer):
+            return PatchTransformer.from_faces(network, config).to(network.face_head.weight.device)
+        return network

@@ -1,0 +1,146 @@
+"""Runs a network on rows of garments: the one place where inputs are turned, mirrored, normalised and cast for it.
+
+    features, velocities, target       world space, physical units
+      turn                             to the heading the network knows (heading.py), and then by `turn`; the rest pose
+                                       by `rest_turn`
+      mirror                           rows that are chosen, in x
+      normalise, noise, cast           statistics of the network; Gaussian noise on its inputs; bfloat16
+    forward_normalised
+      denormalise, mirror, turn back   in float32
+
+Simulation, training and `GarmentNetwork.forward` all come here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+from warpgarment.kernels.features.channels import FACE, Channel, Kind, Layout
+
+from .heading import canonical_frame, rotate_features, rotate_matrices, rotate_vectors
+from .inputs import NormalisedOutput, RowInputs
+from .parametrisation import NetworkOutput
+
+if TYPE_CHECKING:
+    from .network import GarmentNetwork
+
+VELOCITY = Layout([Channel("velocity", 3, Kind.VECTOR)])
+PSI = Layout([Channel("psi", 9, Kind.MAP)])
+
+
+class Ran(NamedTuple):
+    """What came of a call of the network."""
+
+    output: NetworkOutput  # physical units; world space, or the network's frame where the inputs were in it
+    normalised: NormalisedOutput  # in the network's frame
+    target: NormalisedOutput | None  # likewise
+
+
+def run(
+    network: GarmentNetwork,
+    inputs: RowInputs,
+    *,
+    noise: float = 0.0,
+    bfloat16: bool = False,
+    target: NetworkOutput | None = None,
+) -> Ran:
+    """Calls a network.
+
+    Args:
+        network: In whichever mode: dropout is on in training mode.
+        inputs: In world space, or where they say so in the network's frame.
+        noise: Standard deviation of Gaussian noise on the normalised inputs; 0: none.
+        bfloat16: Run `forward_normalised` under autocast to bfloat16; else under whatever autocast the caller is in.
+        target: What the output should be, in the same space as the inputs.
+    """
+    kind = inputs.features.device.type
+    half = bfloat16 or torch.is_autocast_enabled(kind)
+    dtype = torch.bfloat16 if bfloat16 else torch.get_autocast_dtype(kind)
+    mirrored, embedded = inputs.mirrored, None
+    with torch.autocast(kind, enabled=False):  # half precision is for the network, not for positions
+        features, velocities, turn = inputs.features, inputs.velocities, _turn(network, inputs)
+        if not (noise or inputs.in_network_frame or mirrored is not None or inputs.rest_turn is not None):
+            embedded = network.embedded(features, turn, inputs.face_mask)
+        if turn is not None:
+            if embedded is None:
+                features = rotate_features(features, turn, inputs.rest_turn)
+            velocities = rotate_vectors(velocities, turn)
+            target = None if target is None else rotate_output(target, turn)
+        if mirrored is not None:
+            features, velocities = mirror_inputs(features, velocities, mirrored)
+            target = None if target is None else mirror_output(target, mirrored)
+        x = network.encode(features) if embedded is None else embedded
+        v = network.encode_velocities(velocities)
+        if noise:
+            x = x + noise * torch.randn_like(x)
+            v = v + noise * torch.randn_like(v)
+    call = network.forward_normalised if embedded is None else network.forward_embedded
+    with torch.autocast(kind, dtype=dtype, enabled=half):
+        normalised = call(x, v, inputs.rows, face_mask=inputs.face_mask, component_mask=inputs.component_mask)
+    with torch.autocast(kind, enabled=False):
+        wanted = None if target is None else network.normalise_targets(target)
+        output = network.denormalise(normalised)
+        if mirrored is not None:
+            output = mirror_output(output, mirrored)
+        return Ran(rotate_output(output, turn, inverse=True), normalised, wanted)
+
+
+def _turn(network: GarmentNetwork, inputs: RowInputs) -> torch.Tensor | None:
+    """From the inputs' world to the network's frame, [R,3,3]; None where there is nothing to turn."""
+    if inputs.in_network_frame or network.config.heading == "world":
+        return None if inputs.in_network_frame else inputs.turn
+    own = canonical_frame(inputs.features, inputs.face_mask)
+    return own if inputs.turn is None else inputs.turn @ own
+
+
+def rotate_output(output: NetworkOutput, turn: torch.Tensor | None, *, inverse: bool = False) -> NetworkOutput:
+    """Output (or target) turned as the inputs were, or back; unchanged where `turn` is None.
+
+    Args:
+        output: In physical units, shapes as in `NetworkOutput` with rows in front.
+        turn: Rotation of each row, shape [R,3,3].
+        inverse: Back to the world.
+    """
+    if turn is None:
+        return output
+    turn = turn.mT if inverse else turn
+    return NetworkOutput(
+        rotate_matrices(output.psi, turn), output.singular_values, rotate_vectors(output.velocity, turn)
+    )
+
+
+def mirror_inputs(
+    features: torch.Tensor, velocities: torch.Tensor, chosen: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Features [R,N,H*K] and velocities [R,C,(H-1)*3] as a mirror in x shows them, in the rows chosen, bool [R]."""
+    return features * _signs(FACE, features, chosen), velocities * _signs(VELOCITY, velocities, chosen)
+
+
+def mirror_output(output: NetworkOutput, chosen: torch.Tensor) -> NetworkOutput:
+    """Output (or target) as a mirror in x shows it, in the rows chosen, bool [R]; undone by the same."""
+    psi = output.psi.flatten(-2)
+    return output._replace(
+        psi=(psi * _signs(PSI, psi, chosen)).unflatten(-1, (3, 3)),
+        velocity=output.velocity * _signs(VELOCITY, output.velocity, chosen),
+    )
+
+
+def _signs(layout: Layout, values: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+    """Signs [R,1,W] for values [R,*,W] that hold the layout one or several times."""
+    signs = layout.mirror(values.device).repeat(values.shape[-1] // layout.width)
+    return torch.where(chosen[:, None], signs, torch.ones_like(signs))[:, None]
+
+
+@contextmanager
+def evaluating(network: GarmentNetwork) -> Iterator[None]:
+    """A network in evaluation mode, and afterwards in the mode it was in."""
+    training = network.training
+    network.eval()
+    try:
+        yield
+    finally:
+        network.train(training)
