@@ -1,4 +1,4 @@
-"""The recipes of docs/extending_contacts.md, carried out to the letter, with files that are not part of the package."""
+"""The recipes of docs/extending.md, carried out to the letter, with files that are not part of the package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from support.scenes import body, network, skirt, walk
 import warpgarment as wg
 from warpgarment.objects.garment import Garment
 
-TEXT = (Path(__file__).parents[1] / "docs" / "extending_contacts.md").read_text()
+TEXT = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
 
 
 @pytest.fixture

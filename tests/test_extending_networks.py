@@ -1,4 +1,4 @@
-"""What docs/extending_networks.md shows, carried out as it stands there, from outside the package."""
+"""What docs/extending.md shows, carried out as it stands there, from outside the package."""
 
 from __future__ import annotations
 
@@ -12,8 +12,17 @@ from pathlib import Path
 from support import sequences as synthetic_sequences
 
 ROOT = Path(__file__).parents[1]
-TEXT = (ROOT / "docs" / "extending_networks.md").read_text("utf-8")
-MODULE, SCRIPT, ROW, EXPRESSION, REFERENCE, READER = re.findall(r"```(?:python|text)\n(.*?)```", TEXT, re.DOTALL)
+TEXT = (ROOT / "docs" / "extending.md").read_text("utf-8")
+
+
+def blocks(heading: str) -> list[str]:
+    """The blocks of code of a section of the page."""
+    section = TEXT.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return re.findall(r"```(?:python|text)\n(.*?)```", section, re.DOTALL)
+
+
+MODULE, SCRIPT = blocks("A network")
+ROW, EXPRESSION, REFERENCE, READER = blocks("A feature channel")
 
 
 def run(*command: str, folder: Path, path: Path) -> str:

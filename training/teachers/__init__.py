@@ -37,7 +37,7 @@ class TeacherEntry(NamedTuple):
     credit: str
 
 
-# The command line's choices are written out in `GenerateConfig.teacher`. docs/extending_files.md adds one.
+# The command line's choices are written out in `GenerateConfig.teacher`. docs/extending.md adds one.
 TEACHERS: dict[str, TeacherEntry] = {
     "newton": TeacherEntry(
         "warpgarment.training.teachers.newton.teacher", "physics", ("newton", "warp-lang"), "Newton (Apache-2.0)"

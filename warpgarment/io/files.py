@@ -15,7 +15,7 @@ from warpgarment.errors import MeshError
 from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
 from .parts import unnamed
 
-# Suffixes -> the module whose FORMAT reads and writes them; "" is a folder. docs/extending_files.md adds one.
+# Suffixes -> the module whose FORMAT reads and writes them; "" is a folder. docs/extending.md adds one.
 FORMATS: dict[tuple[str, ...], str] = {
     (".obj",): "warpgarment.io.obj",
     (".ply",): "warpgarment.io.ply",
