@@ -45,7 +45,7 @@ def test_no_json(tmp_path):
     """A damaged file would be an error of Python's decoder."""
     for data in (b"{", b"\xff\xfe{", b"", b'{"a": ' + b"9" * 5000 + b"}"):
         (tmp_path / "a.json").write_bytes(data)
-        with pytest.raises(MeshError, match="a.json is not JSON"):
+        with pytest.raises(MeshError, match=r"a\.json is not JSON"):
             read_json(tmp_path / "a.json")
 
 
@@ -67,5 +67,5 @@ def test_names_stay_in_their_folder(tmp_path):
         "C:/secret.txt",
     )
     for name in (*refused, "a" * 300, "a/" * 3000, "", None, ["clips"], "a\0b"):
-        with pytest.raises(MeshError, match="^meta: clip"):
+        with pytest.raises(MeshError, match=r"^meta: clip"):
             below(root, name, "meta: clip")

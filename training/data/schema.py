@@ -123,7 +123,7 @@ SET: Mapping[str, Kind] = {
 
 
 def faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> dict[str, str]:
-    """Entries of another kind than they may be: name -> the value and what it should be. Absent entries are no fault."""
+    """Entries of another kind than they may be: name -> what it should be. Absent ones are no fault."""
     return {
         key: f"says {shown(manifest[key])} for {key}, which must be {kind.what}"
         for key, kind in kinds.items()
