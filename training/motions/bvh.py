@@ -112,7 +112,7 @@ def _header(file: str, words: Sequence[Sequence[str]], motion: tuple[int, int]) 
     for value, place, name in ((frames, 1, "Frames"), (frame_time, 4, "Frame Time")):
         if not 0 < value < 1e9 or (name == "Frames" and value != int(value)):
             raise MeshError(
-                f"{file}, line {head[place][0] + 1}: {found[place][:40]!r} is no {name}: not a number above 0."
+                f"{file}, line {head[place][0] + 1}: {found[place][:40]!r} is no {name}: not above 0 and below 1e9."
             )
     return int(frames), frame_time, (head[4][0], head[4][1] + 1)
 
