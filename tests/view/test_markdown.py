@@ -84,7 +84,8 @@ def test_tables_are_written_as_published(name, extra):
 
 STRANGE = (
     "<img src=x onerror=alert(1)>", "[a](http://b.c)", "![a](//b.c/d.png)", "a|b", "`x` ``y``", "**bold** _it_ ~~no~~",
-    "a\n\n# heading\n- item", "&lt;b&gt;", "\\", "\\|", "$x^2$ $`y`$", "<!-- ", "https://b.c www.b.c me@b.c", "\x1b[31m",
+    "a\n\n# heading\n- item", "&lt;b&gt;", "\\", "\\|", "$x^2$ $`y`$", "<!-- ",
+    "https://b.c www.b.c me@b.c", "\x1b[31m",
 )  # fmt: skip
 
 
