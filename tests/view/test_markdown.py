@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ from benchmarks import report, teacher, teachers_side_by_side
 from warpgarment.training.data import card_page
 from warpgarment.training.evaluate import measure as evaluate
 from warpgarment.training.tables.report import grid, means_table
-from warpgarment.view.markdown import table
+from warpgarment.view.markdown import code, escape, table
 
 RESULTS = Path(report.__file__).parent / "results"
 
@@ -78,3 +80,34 @@ def test_tables_are_written_as_published(name, extra):
     """A table of the paper reads otherwise than the published one of the same rows."""
     result, page = recorded(name)
     assert "\n".join(means_table(result["rows"], extra)) in page
+
+
+STRANGE = (
+    "<img src=x onerror=alert(1)>", "[a](http://b.c)", "![a](//b.c/d.png)", "a|b", "`x` ``y``", "**bold** _it_ ~~no~~",
+    "a\n\n# heading\n- item", "&lt;b&gt;", "\\", "\\|", "$x^2$ $`y`$", "<!-- ",
+    "https://b.c www.b.c me@b.c", "\x1b[31m",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", STRANGE)
+def test_text_of_others_is_shown_as_text(text):
+    """A name in a manifest would become a tag, a picture of another host or a cell of a table."""
+    escaped = escape(text)
+    assert "\n" not in escaped
+    assert not set("<>\x1b") & set(escaped)
+    bare = re.sub(r"\\[!-/:-@\[-`{-~]", "", escaped)  # without what a backslash makes plain
+    assert not set("`*|~$\\#") & set(re.sub(r"&#\d+;", "", bare))
+    assert not re.search(r"!\[|\][(\[:]", bare)
+    assert not re.search(r"https?:|www\.|@", bare)
+    shown = html.unescape(re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", escaped))
+    assert shown == " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    span = code(text)
+    fence = re.match("`+", span)[0]
+    assert span.endswith(fence)
+    assert fence not in re.findall("`+", span[len(fence) : -len(fence)])
+
+
+def test_ordinary_names_stay_as_they_are():
+    """Pages would be full of backslashes. Exact."""
+    for name in ("cmu_07_01", "T-shirt", "procedural:sway 3", "depth [mm]", "newton 1.0.1+cpu"):
+        assert escape(name) == name

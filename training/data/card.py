@@ -21,6 +21,7 @@ from .card_facts import Facts, Values
 from .card_page import page
 from .card_pictures import bars, contact_sheet, histograms
 from .layout import SPLITS
+from .sequence import read_array
 
 PICTURES = 12
 _FIGURES = {  # figure of the quality gate -> heading, factor
@@ -120,7 +121,7 @@ def materials(facts: Facts) -> Values:
     rows: list[tuple[Mapping[str, Any], str, Any]] = []
     for manifest in facts.good.values():
         for garment in manifest.get("garments") or []:
-            for key, value in garment.get("material", {}).items():
+            for key, value in (garment.get("material") or {}).items():
                 heading, by = _MATERIALS.get(key, (key, 1.0))
                 rows += [(manifest, heading, value * by)] if _is_number(value) else []
     values = _by_split(rows)
@@ -132,7 +133,7 @@ def wind(facts: Facts) -> Values:
     rows: list[tuple[Mapping[str, Any], str, Any]] = []
     for folder, manifest in facts.good.items():
         if (folder / "wind.npy").exists():
-            speed = np.linalg.norm(np.load(folder / "wind.npy", allow_pickle=False), axis=1)
+            speed = np.linalg.norm(read_array(folder, "wind").reshape(-1, 3), axis=1)
             rows += [(manifest, "mean wind [m/s]", float(speed.mean())), (manifest, "gusts [m/s]", float(speed.max()))]
     return _by_split(rows)
 

@@ -42,7 +42,7 @@ def page(facts: Facts, drawn: Mapping[str, Values], reasons: Counter[str]) -> st
     size = sum(p.stat().st_size for folder in facts.good for p in folder.iterdir())
     rates = " and ".join(f"{fps:g}" for fps in sorted({m["fps"] for m in good}))
     lines = [
-        f"# {facts.root.resolve().name}",
+        f"# {markdown.escape(facts.root.resolve().name)}",
         "",
         f"{len(good):,} simulated sequences of clothed, moving bodies: {frames:,} frames at {rates} a second. "
         f"{size / 1e6:,.1f} MB, {size / frames:,.0f} bytes a frame, the body included.",
@@ -73,18 +73,20 @@ def _made(facts: Facts) -> list[str]:
     seeds = {m.get("seed") for m in facts.good.values() if m.get("seed") is not None}
     lines = []
     if configuration.get("recipe"):
-        lines.append(f"Recipe `{configuration['recipe']}`, seed {configuration.get('seed', 0)}. To make it again:")
-        lines += ["", f"    {common.get('command') or _command(common)}", ""]
+        lines.append(
+            f"Recipe {markdown.code(configuration['recipe'])}, seed {configuration.get('seed', 0)}. To make it again:"
+        )
+        lines += ["", "    " + " ".join(str(common.get("command") or _command(common)).split()), ""]
     elif seeds and len(seeds) == 1:
         lines += [f"Seed {seeds.pop()}. Every manifest holds the parameters of its sequence.", ""]
     versions: Mapping[str, Any] = common.get("versions") or next(
         (m["versions"] for m in manifests if m.get("versions")), {}
     )
     if versions:
-        lines += ["Versions: " + ", ".join(f"{k} {v}" for k, v in versions.items() if v) + ".", ""]
+        lines += ["Versions: " + ", ".join(markdown.escape(f"{k} {v}") for k, v in versions.items() if v) + ".", ""]
     settings = {k: v for k, v in teacher.items() if not isinstance(v, (dict, list))}
     if settings:
-        lines += ["Teacher: " + ", ".join(f"{k} {v}" for k, v in settings.items()) + ".", ""]
+        lines += ["Teacher: " + ", ".join(markdown.escape(f"{k} {v}") for k, v in settings.items()) + ".", ""]
     return lines or ["Not known: there is no `set.json`.", ""]
 
 
@@ -106,7 +108,7 @@ def counts(good: Sequence[Mapping[str, Any]]) -> list[str]:
     splits = [s for s in SPLITS if any(m.get("split") == s for m in good)]
     rows = []
     for category in [*sorted({str(m.get("category", "-")) for m in good}), "together"]:
-        row: list[Any] = [category]
+        row: list[Any] = [markdown.escape(category)]
         for split in [*splits, None]:
             here = [
                 m["frames"]
@@ -119,7 +121,10 @@ def counts(good: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _by_count(title: str, counts: Counter[str]) -> list[str]:
-    return [f"{title}: " + ", ".join(f"{name} ({count})" for name, count in sorted(counts.items())) + ".", ""]
+    return [
+        f"{title}: " + ", ".join(f"{markdown.escape(name)} ({count})" for name, count in sorted(counts.items())) + ".",
+        "",
+    ]
 
 
 def _kind_of_body(manifest: Mapping[str, Any]) -> str:
@@ -133,7 +138,7 @@ def _summary(values: Values) -> list[str]:
     for name, splits in values.items():
         everything = np.concatenate([np.asarray(v) for v in splits.values()])
         shown = (everything.mean(), everything.min(), *np.quantile(everything, [0.05, 0.5, 0.95]), everything.max())
-        rows.append([name, len(everything), *(f"{value:.3g}" for value in shown)])
+        rows.append([markdown.escape(name), len(everything), *(f"{value:.3g}" for value in shown)])
     return table(["", "values", "mean", "least", "5 %", "median", "95 %", "most"], rows)
 
 
@@ -146,7 +151,12 @@ def _rejections(facts: Facts, reasons: Counter[str]) -> list[str]:
     ]
     if not reasons:
         return lines
-    return [*lines, *table(["reason", "attempts"], reasons.most_common()), "![Rejections](card/rejections.png)", ""]
+    return [
+        *lines,
+        *table(["reason", "attempts"], [(markdown.escape(reason), n) for reason, n in reasons.most_common()]),
+        "![Rejections](card/rejections.png)",
+        "",
+    ]
 
 
 def credits(facts: Facts) -> list[str]:

@@ -70,7 +70,7 @@ def histograms(
         everything = np.concatenate([np.asarray(v, float) for v in splits.values()])
         edges = np.histogram_bin_edges(everything, bins)
         axis.hist(list(splits.values()), edges, stacked=True, label=list(splits), color=[COLOURS[s] for s in splits])
-        axis.set_title(title, fontsize=9)
+        axis.set_title(title[:60], fontsize=9, parse_math=False)
     axes[0].legend(frameon=False, fontsize=8)
     wide, high = figure.get_size_inches()
     edges_of = {"left": 0.35 / wide, "right": 1 - 0.1 / wide, "bottom": 0.25 / high, "top": 1 - 0.3 / high}
@@ -82,7 +82,8 @@ def bars(path: Path, counts: Mapping[str, int], title: str) -> None:
     """Draws one horizontal bar per entry, the first on top."""
     figure, (axis,) = _axes(1, 1, height=0.8 + 0.24 * len(counts), width=7.0)
     names = list(counts)[::-1]
-    axis.barh(names, [counts[name] for name in names], color=draw.SLATE)
+    axis.barh(range(len(names)), [counts[name] for name in names], color=draw.SLATE)
+    axis.set_yticks(range(len(names)), names, parse_math=False)
     axis.set_title(title, fontsize=9)
     axis.locator_params(axis="x", integer=True)
     figure.set_layout_engine("constrained")

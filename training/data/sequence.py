@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,12 +22,14 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.atomic import atomic_folder
+from warpgarment.io.plain import open_plain
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 
 from .encoding import decoded, encoded, stored_body, stored_transforms
 from .layout import AGAIN, ARRAYS, STORED, check_fit, expected
-from .set_manifest import DatasetMismatch, read_json, read_set_manifest, write_set_manifest
+from .schema import SEQUENCE
+from .set_manifest import DatasetMismatch, read_checked, read_set_manifest, write_set_manifest
 
 __all__ = [
     "ARRAYS", "FORMAT", "MANIFEST", "DatasetMismatch", "Layer", "Sequence", "list_sequences", "read_manifest",
@@ -35,6 +38,7 @@ __all__ = [
 
 FORMAT = 2
 MANIFEST = "manifest.json"
+MOST_BYTES = 1 << 30  # of an array that is copied into memory
 _LARGE = ("garment_positions", "body_positions", "garment_vertices")  # mapped; others would cost an open file each
 _OF_FRAMES = (  # arrays of the body with one entry per frame: format 1, then 2
     "bone_transforms", "bone_rotations", "bone_translations", "bone_origins", "body_positions", "body_boxes",
@@ -86,7 +90,7 @@ class Sequence:
         if not (isinstance(fps, (int, float)) and 0 < fps < np.inf):
             raise MeshError(f"{folder.name}: {MANIFEST} says {fps!r} frames per second. {AGAIN}")
         schema = expected(version, {path.stem for path in folder.glob("*.npy")})
-        stored = {name: _read(folder, name) for name in schema}
+        stored = {name: read_array(folder, name) for name in schema}
         check_fit(folder.name, stored, schema)
         sequence = cls(folder, manifest, stored)
         count = len(sequence.starts) - 1
@@ -191,23 +195,50 @@ class Sequence:
         return self.manifest.get("format", 1) == 1
 
 
-def _read(folder: Path, name: str) -> np.ndarray:
-    """One array, copied into memory unless it is large."""
+def read_array(folder: Path, name: str) -> np.ndarray:
+    """One array of a sequence, copied into memory unless it is of those that are large.
+
+    Raises:
+        MeshError: There is none, it is no plain file of one array, or it is larger than such an array may be.
+    """
+    path = Path(folder) / f"{name}.npy"
     try:
-        array = np.lib.format.open_memmap(folder / f"{name}.npy", mode="r")  # refuses pickled arrays
+        check_array_file(path)
+        array = np.lib.format.open_memmap(path, mode="r")  # refuses pickled arrays
+    except MeshError as error:
+        reason = str(error).removeprefix(f"{path} ").rstrip(".")
+        raise MeshError(f"{folder.name}: {name}.npy cannot be read (it {reason}). {AGAIN}") from None
     except (OSError, ValueError, EOFError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise MeshError(f"{folder.name}: {name}.npy cannot be read ({reason}). {AGAIN}") from None
+    if name not in _LARGE and array.nbytes > MOST_BYTES:
+        raise MeshError(f"{folder.name}: {name}.npy has {array.nbytes:,} bytes, at most {MOST_BYTES:,}. {AGAIN}")
     return array if name in _LARGE else np.array(array)
+
+
+def check_array_file(path: Path) -> None:
+    """Checks that a file is a plain one with as many bytes as the array in its header needs; reads no more than that.
+
+    Raises:
+        MeshError: It is another kind of file, or has other bytes.
+        OSError, ValueError: It cannot be read, or does not begin as a .npy file.
+    """
+    with open_plain(path) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+        size, needed = path.stat().st_size, file.tell() + dtype.itemsize * math.prod(shape)
+    if size != needed and not dtype.hasobject:
+        raise MeshError(f"{path} has {size:,} bytes, its header says {needed:,}.")
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a sequence folder.
 
     Raises:
-        MeshError: There is no manifest, or it is not a JSON object.
+        MeshError: There is no manifest, it is not a JSON object, or an entry is of another kind than in `schema`.
     """
-    return read_json(Path(folder) / MANIFEST)
+    return read_checked(Path(folder) / MANIFEST, SEQUENCE)
 
 
 def list_sequences(root: str | Path, split: str | None = None, status: str | None = "good") -> list[Path]:

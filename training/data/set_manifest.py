@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from warpgarment.errors import MeshError
 from warpgarment.io.atomic import atomic_file
+from warpgarment.io.plain import read_json
 from warpgarment.training.teachers import TEACHERS
+
+from .schema import SET, Kind, faults
 
 SET_MANIFEST = "set.json"
 _SIMULATE = dict.fromkeys(package for teacher in TEACHERS.values() for package in teacher.packages)
@@ -93,22 +97,31 @@ def read_set_manifest(root: str | Path) -> dict[str, Any] | None:
         MeshError: The manifest is damaged.
     """
     path = Path(root) / SET_MANIFEST
-    return read_json(path) if path.exists() else None
+    return read_checked(path, SET) if os.path.lexists(path) else None
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file.
+def read_checked(path: Path, kinds: Mapping[str, Kind] | None) -> dict[str, Any]:
+    """A manifest from a file.
+
+    Args:
+        path: The file.
+        kinds: Kinds of the entries, of `schema`; None leaves them unchecked.
 
     Raises:
-        MeshError: The file is missing, damaged or holds something else.
+        MeshError: The file is missing, no plain file, larger or more deeply nested than `io.plain` allows, or not a
+            JSON object, or an entry is of another kind; the error names it.
     """
     try:
-        content = json.loads(path.read_text("utf-8"))
-        if not isinstance(content, dict):
-            raise ValueError("not a JSON object")
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise MeshError(f"{path.parent} holds no readable {path.name} ({reason}).") from error
+        content = read_json(path)
+    except OSError as error:
+        raise MeshError(f"{path.parent} holds no readable {path.name} ({error.strerror}).") from error
+    except MeshError as error:
+        raise MeshError(f"{path.parent} holds no readable {path.name} ({error})") from None
+    if not isinstance(content, dict):
+        raise MeshError(f"{path.parent} holds no readable {path.name} (not a JSON object).")
+    wrong = faults(content, kinds or {})
+    if wrong:
+        raise MeshError(f"{path}: {next(iter(wrong.values()))}. It is damaged: write it again.")
     return content
 
 

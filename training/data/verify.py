@@ -9,9 +9,8 @@ held-out category is trained on, and there are no unfinished sequences.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,13 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.plain import open_plain
 from warpgarment.view.report import table
 
 from .layout import SPLITS
-from .sequence import MANIFEST, Sequence, read_manifest
-from .set_manifest import planned_numbers, read_set_manifest
+from .schema import SEQUENCE, faults, is_finite, shown
+from .sequence import MANIFEST, Sequence, check_array_file
+from .set_manifest import planned_numbers, read_checked, read_set_manifest
 
 NOT_SEQUENCES = ("card",)  # other folders that a set may hold
 _HELD_OUT_BY_CATEGORY = ("cloth3d",)  # recipes with held-out categories; outfits and cuts are split otherwise
@@ -136,7 +137,7 @@ def check_sequence(folder: Path) -> Entry:
     """Reads one sequence completely and lists its faults."""
     try:
         size = sum(p.stat().st_size for p in folder.iterdir() if p.is_file())
-        manifest = read_manifest(folder)
+        manifest = read_checked(folder / MANIFEST, None)
     except (MeshError, OSError) as error:
         return Entry(folder.name, {}, 0, (), (Problem(folder.name, str(error)),))
     problems = _manifest_problems(manifest)
@@ -155,39 +156,23 @@ def check_sequence(folder: Path) -> Entry:
 def _manifest_problems(manifest: dict[str, Any]) -> list[str]:
     """Entries that a manifest must have and lacks."""
 
-    def text(value: Any) -> bool:
-        return isinstance(value, str) and bool(value)
-
-    def number(value: Any) -> bool:
-        return isinstance(value, (int, float)) and math.isfinite(value)
-
     rejected = manifest.get("status") == "rejected"
-    needed: dict[str, Callable[[Any], bool]] = {
-        "status": lambda v: v in ("good", "rejected"),
-        "split": lambda v: v in SPLITS,
-        "garment": text,
-        "motion": text,
-        "fps": lambda v: number(v) and v > 0,
-        "frames": lambda v: isinstance(v, int) and v >= (0 if rejected else 1),
-        "checksums": lambda v: isinstance(v, dict) and (rejected or bool(v)),
-    }
-    if rejected:
-        needed["reason"] = text
-    optional: dict[str, Callable[[Any], bool]] = {
-        "number": lambda v: isinstance(v, int),
-        "garments": lambda v: isinstance(v, list) and all(isinstance(g, dict) for g in v),
-        "rejected_attempts": lambda v: isinstance(v, list),
-    }
+    needed = ["status", "split", "garment", "motion", "fps", "frames", "checksums", *(["reason"] if rejected else [])]
     problems = [f"{MANIFEST} does not say {key}" for key in needed if key not in manifest]
-    problems += [
-        f"{MANIFEST} says {manifest[key]!r} for {key}"
-        for key, fits in {**needed, **optional}.items()
-        if key in manifest and not fits(manifest[key])
-    ]
+    wrong = faults(manifest, SEQUENCE)
     figures = manifest.get("figures", {})
+    if isinstance(figures, dict):
+        wrong.pop("figures", None)  # told below, by name
+    problems += [f"{MANIFEST} {fault}" for fault in wrong.values()]
+    empty = ["garment", "motion", *(["reason"] if rejected else ["frames", "checksums"])]
+    problems += [
+        f"{MANIFEST} says {shown(manifest[key])} for {key}"
+        for key in empty
+        if key in manifest and key not in wrong and not manifest[key]
+    ]
     if not isinstance(figures, dict):
         problems.append(f"{MANIFEST} has figures that are not named")
-    elif bad := [key for key, value in figures.items() if not number(value)]:
+    elif bad := [key for key, value in figures.items() if not (isinstance(value, bool) or is_finite(value))]:
         problems.append(f"{MANIFEST} has {len(bad)} figures that are not finite (first: {bad[0]})")
     return problems
 
@@ -199,9 +184,32 @@ def _file_problems(folder: Path, manifest: dict[str, Any]) -> list[str]:
     problems = [f"{name} is missing" for name in sorted(set(checksums) - present)]
     problems += [f"{name} is not in {MANIFEST}" for name in sorted(present - set(checksums))]
     for name in sorted(present & set(checksums)):
-        if hashlib.sha256((folder / name).read_bytes()).hexdigest() != checksums[name]:
-            problems.append(f"{name} does not have its checksum. Generate the sequence again.")
+        try:
+            if _sha256(folder / name) != checksums[name]:
+                problems.append(f"{name} does not have its checksum. Generate the sequence again.")
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else str(error).removeprefix(f"{folder / name} ")
+            problems.append(f"{name} cannot be read ({reason}). Generate the sequence again.")
     return problems
+
+
+def _sha256(path: Path) -> str:
+    """Checksum of a file, read in pieces; "" for an array whose header speaks of another number of bytes.
+
+    Raises:
+        MeshError: It is no plain file.
+        OSError: It cannot be read.
+    """
+    with open_plain(path) as file:
+        if path.suffix == ".npy":
+            try:
+                check_array_file(path)
+            except ValueError:
+                return ""
+        digest = hashlib.sha256()
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+        return digest.hexdigest()
 
 
 def _content(sequence: Sequence) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.data.card_page import counts, credits, table
 from warpgarment.training.tables.protocol import FIGURES, METHODS, STARTS
+from warpgarment.view.markdown import code, escape
 
 if TYPE_CHECKING:
     from warpgarment.training.data.card_facts import Facts
@@ -82,11 +83,13 @@ def ratio(row: Mapping[str, Any]) -> float:
 
 def _data(notes: Mapping[str, Any], facts: Facts) -> list[str]:
     known = notes.get("data")
-    trained = f"Trained on: {_plainly(known)}." if known else "The checkpoint does not say what it was trained on."
+    trained = (
+        f"Trained on: {escape(_plainly(known))}." if known else "The checkpoint does not say what it was trained on."
+    )
     good = list(facts.good.values())
-    lines = [f"{trained} Evaluated on `{facts.root.resolve().name}`:", "", *counts(good)]
+    lines = [f"{trained} Evaluated on {code(facts.root.resolve().name)}:", "", *counts(good)]
     if facts.common.get("command"):
-        lines += ["To make that set again:", "", f"    {facts.common['command']}", ""]
+        lines += ["To make that set again:", "", "    " + " ".join(str(facts.common["command"]).split()), ""]
     return lines
 
 
@@ -95,7 +98,10 @@ def _training(notes: Mapping[str, Any], log: Sequence[Mapping[str, Any]]) -> lis
     rows = [[key, _plainly(value)] for key, value in notes.items() if key not in ("training", "data")]
     lines = table(["budget", "value"], rows) if rows else ["The checkpoint has no notes.", ""]
     if isinstance(settings, Mapping):
-        lines += ["Settings: " + ", ".join(f"{key} {_plainly(value)}" for key, value in _flat(settings)) + ".", ""]
+        lines += [
+            "Settings: " + ", ".join(escape(f"{key} {_plainly(value)}") for key, value in _flat(settings)) + ".",
+            "",
+        ]
     if log:
         lines += ["![Training loss and validation error](card/training.png)", ""]
         best = [line for line in log if isinstance(line.get("rollout_error_cm"), (int, float))]
@@ -155,8 +161,9 @@ def _cases(rows: Sequence[Mapping[str, Any]], drawn: Sequence[Drawn], rule: str)
         skin = row["skinned"][_ERROR]
         at = ", ".join(f"{t} ({shown.errors[t - 1]:.1f} cm)" if t else "0 (given)" for t in shown.moments)
         lines += [
-            f"**{case.role.capitalize()}**: {row['sequence']}, {row.get('category') or 'no category'}, "
-            f"{row.get('motion') or 'motion not named'}. Network {error}, skinned {skin:.2f} cm, ratio "
+            f"**{case.role.capitalize()}**: {escape(row['sequence'])}, "
+            f"{escape(row.get('category') or 'no category')}, "
+            f"{escape(row.get('motion') or 'motion not named')}. Network {error}, skinned {skin:.2f} cm, ratio "
             f"{case.ratio:.2f}. Frames {at}.",
             "",
         ]
@@ -164,7 +171,7 @@ def _cases(rows: Sequence[Mapping[str, Any]], drawn: Sequence[Drawn], rule: str)
             before = row["network"].get(_ERROR)
             outcome = "failed" if before is None else f"gave {before:.2f} cm"
             lines += [f"Rolled out again for the picture; when it was evaluated it {outcome}.", ""]
-        lines += [f"![{case.role}: {row['sequence']}](card/{case.file})", ""]
+        lines += [f"![{case.role}: {escape(row['sequence'])}](card/{case.file})", ""]
     return lines
 
 

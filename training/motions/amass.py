@@ -16,6 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
+from warpgarment.io.npz import read_npz
+from warpgarment.io.plain import open_plain
 
 from .clip import Clip, checked_finite, frame_rate
 
@@ -107,16 +109,20 @@ def amass_length(path: str | Path) -> tuple[int, float]:
 def _opened(path: Path, names: tuple[str, ...]) -> dict:
     """The named arrays and `rate`, a number."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            rates = [name for name in _RATES if name in data.files]
-            missing = [name for name in ("poses", "trans") if name not in data.files]
-            if missing or not rates:
-                raise MeshError(
-                    f"{path.name} is no AMASS motion: it lacks {', '.join(missing) or 'mocap_framerate'}; "
-                    f"it holds {', '.join(data.files[:8]) or 'nothing'}."
-                )
-            rate = np.asarray(data[rates[0]])
-            arrays = {name: data[name] for name in names}
+        with open_plain(path) as file, zipfile.ZipFile(file) as archive:
+            there = [name.removesuffix(".npy") for name in archive.namelist()]
+        rates = [name for name in _RATES if name in there]
+        missing = [name for name in ("poses", "trans") if name not in there]
+        if missing or not rates:
+            raise MeshError(
+                f"{path.name} is no AMASS motion: it lacks {', '.join(missing) or 'mocap_framerate'}; "
+                f"it holds {', '.join(there[:8]) or 'nothing'}."
+            )
+        try:
+            arrays = read_npz(path, wanted={*names, rates[0]}.__contains__)
+        except MeshError as error:
+            raise MeshError(f"{path.name} is not an .npz file of plain arrays ({error})") from None
+        rate = arrays.pop(rates[0])
     except (MeshError, FileNotFoundError):
         raise
     except _UNREADABLE as error:

@@ -30,6 +30,7 @@ from warpgarment.errors import MeshError
 from warpgarment.io.obj import read_obj
 
 from .axes import y_up
+from .fields import betas, numbers
 from .matlab import read_mat
 from .pc16 import read_pc16
 from .recording import RecordedGarment, Recording, recorded_garment
@@ -66,7 +67,9 @@ def read_cloth3d(folder: str | Path, *, body: BodySource = None, fps: float = 30
         "garments": {name: _fabric(outfit.get(name)) for name in names},
     }
     if "tightness" in info:
-        attributes["tightness"] = np.ravel(info["tightness"]).astype(float).tolist()
+        attributes["tightness"] = np.ravel(
+            numbers(f"{folder / INFO}: tightness", info["tightness"], (0, 1, 2))
+        ).tolist()
     return Recording(
         garments,
         body_from(body, poses),
@@ -113,7 +116,7 @@ def _poses(folder: Path, info: dict[str, Any], turn: Rotation, fps: float) -> Sm
     poses = SmplPoses(
         rotations,
         trans,
-        betas=np.ravel(np.asarray(info.get("shape", np.zeros(10)), dtype=np.float64)),
+        betas=np.ravel(betas(f"{folder / INFO}: shape", info.get("shape", np.zeros(10)), 1)),
         gender="male" if _number(folder, info, "gender") else "female",
         fps=fps,
         up="z",

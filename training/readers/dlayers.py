@@ -25,7 +25,6 @@ cloth and wind are kept in `attributes`; `materials` and `wind` are these settin
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +33,18 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
 from warpgarment.io.npz import read_npz
+from warpgarment.io.plain import below, read_json
 
 from .axes import y_up
 from .blender_cloth import blender_material, mass_ratio, wind_speed
+from .fields import betas, number, numbers
 from .recording import RecordedGarment, Recording, recorded_garment
 from .smpl import BodySource, SmplPoses, body_from
-from .unpickle import read_pickle
+from .unpickle import SHARE, SPARE, read_pickle
 
 META = "meta.json"
 FPS = 30.0
+MOST_FRAMES = 100_000  # of a sample
 
 
 def read_dlayers(
@@ -65,6 +67,8 @@ def read_dlayers(
     human, entries = meta["human"], _outer_last(folder, meta["garment"])
     scale = _number(folder, human, "scale")
     first, last = int(_number(folder, human, "seq_start")), int(_number(folder, human, "seq_end"))
+    if last - first > MOST_FRAMES:
+        raise MeshError(f"{folder / META}: frames {first:,} to {last:,}: at most {MOST_FRAMES:,} of them are read.")
     if scale <= 0 or not 0 <= first < last:
         raise MeshError(f"{folder / META}: scale {scale:g}, frames {first} to {last}: not a sequence.")
     poses = None
@@ -102,9 +106,9 @@ def _meta(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise MeshError(f"{folder} holds no {META}: it is not the folder of a D-LAYERS sample.")
     try:
-        meta = json.loads(path.read_text("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise MeshError(f"{path}: not readable JSON ({str(error)[:200]}). It is damaged or cut short.") from None
+        meta = read_json(path)
+    except MeshError as error:
+        raise MeshError(f"{path}: not readable JSON ({error})") from None
     if isinstance(meta, dict) and isinstance(meta.get("simulate"), dict):
         meta = {**meta["simulate"], **meta}
     known = isinstance(meta, dict) and isinstance(meta.get("human"), dict) and isinstance(meta.get("garment"), list)
@@ -140,6 +144,9 @@ def _array(path: Path, data: Any, key: str, kinds: str, shape: tuple[int | None,
     """An array, or a list of arrays of one shape, from a dictionary; None in `shape` stands for any size."""
     array = data.get(key) if isinstance(data, dict) else None
     if isinstance(array, list) and array and all(isinstance(part, np.ndarray) for part in array):
+        size, most = sum(part.nbytes for part in array), SHARE * path.stat().st_size + SPARE
+        if size > most:
+            raise MeshError(f"{path}: {key!r} is a list of {size:,} bytes; a file of this size may hold {most:,}.")
         array = np.stack(array) if len({part.shape for part in array}) == 1 else None
     if isinstance(array, np.ndarray) and array.dtype.kind in kinds and array.ndim == len(shape):
         if all(want in (None, size) for want, size in zip(shape, array.shape, strict=True)):
@@ -150,7 +157,7 @@ def _array(path: Path, data: Any, key: str, kinds: str, shape: tuple[int | None,
 
 
 def _poses(folder: Path, human: dict[str, Any], root: Path, first: int, last: int) -> SmplPoses:
-    path = root / str(human.get("motion_path"))
+    path = below(root, human.get("motion_path"), f"{folder / META}: human.motion_path")
     if not path.is_file():
         raise MeshError(
             f"{folder}: the clip {human.get('motion_path')!r} is not below {root}. Give the folder it is relative to "
@@ -161,40 +168,44 @@ def _poses(folder: Path, human: dict[str, Any], root: Path, first: int, last: in
     for key, columns in (("poses", 72), ("trans", 3)):
         array = _array(path, data, key, "f", (None, columns))
         if len(array) == 1:
-            array = np.repeat(array, last, axis=0)
+            array = np.broadcast_to(array, (last, columns))  # which needs no memory
         if len(array) < last:
             raise MeshError(f"{path}: {len(array):,} frames of {key}, {folder / META} asks for {first:,} to {last:,}.")
         arrays.append(array[first:last].astype(np.float64))
-    betas = np.ravel(np.asarray(human.get("betas", np.zeros(10)), dtype=np.float64))
+    shape = np.ravel(betas(f"{folder / META}: human.betas", human.get("betas", [0.0] * 10), 1))
     gender = str(human.get("gender", "neutral"))
-    return SmplPoses(arrays[0].reshape(-1, 24, 3), arrays[1], betas, gender, FPS, source=str(path))
+    return SmplPoses(arrays[0].reshape(-1, 24, 3), arrays[1], shape, gender, FPS, source=str(path))
 
 
 def _pivots(folder: Path, meta: dict[str, Any]) -> list[dict[str, Any]]:
     fields = meta.get("wind") or []
-    if not isinstance(fields, list) or len(fields) > 1:
+    if not isinstance(fields, list) or len(fields) > 1 or not all(isinstance(field, dict) for field in fields):
         raise MeshError(f"{folder / META}: 'wind' must be a list of one field.")
-    return list(fields[0].get("pivot_list", [])) if fields else []
+    pivots = fields[0].get("pivot_list", []) if fields else []
+    if not isinstance(pivots, list) or not all(isinstance(pivot, dict) for pivot in pivots):
+        raise MeshError(f"{folder / META}: 'wind' must have a 'pivot_list' of fields, it has {str(pivots)[:40]!r}.")
+    return pivots
 
 
 def _wind(
     folder: Path, human: dict[str, Any], pivots: list[dict[str, Any]], frames: int, ratio: float, scale: float
 ) -> np.ndarray | None:
     """Velocity of the air in each frame [m/s], Y up, shape [T, 3]; None for still air."""
-    wind = np.zeros((frames, 3))
-    try:
-        for pivot in sorted(pivots, key=lambda p: p["frame_start"]):
-            start = max(int(pivot["frame_start"] - human["frame_start"]), 0)
-            turn = Rotation.from_quat(np.roll(np.asarray(pivot["rotation_quaternion"], dtype=np.float64), -1))
-            speed = wind_speed(float(np.ravel(pivot["strength"])[0]), ratio=ratio, scale=scale, fps=FPS)
-            wind[start:] = y_up(turn.apply([0.0, 0.0, speed]))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise MeshError(f"{folder / META}: 'wind' cannot be read ({type(error).__name__}: {error}).") from None
-    return wind if pivots else None
+    if not pivots:
+        return None
+    wind, place = np.zeros((frames, 3)), f"{folder / META}: 'wind' cannot be read: pivot_list"
+    begin = _number(folder, human, "frame_start")
+    starts = [number(f"{place}[{k}].frame_start", pivot.get("frame_start")) for k, pivot in enumerate(pivots)]
+    for k in sorted(range(len(pivots)), key=starts.__getitem__):
+        turn = numbers(f"{place}[{k}].rotation_quaternion", pivots[k].get("rotation_quaternion"))
+        if len(turn) != 4 or not turn.any():
+            raise MeshError(f"{place}[{k}].rotation_quaternion must be four numbers, w, x, y, z, not all of them zero.")
+        strength = np.ravel(numbers(f"{place}[{k}].strength", pivots[k].get("strength"), (0, 1)))[0]
+        speed = wind_speed(float(strength), ratio=ratio, scale=scale, fps=FPS)
+        start = int(np.clip(starts[k] - begin, 0, frames))
+        wind[start:] = y_up(Rotation.from_quat(np.roll(turn, -1)).apply([0.0, 0.0, speed]))
+    return wind
 
 
 def _number(folder: Path, human: dict[str, Any], name: str) -> float:
-    value = human.get(name)
-    if not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise MeshError(f"{folder / META}: human.{name} must be a number, it is {str(value)[:40]!r}.")
-    return float(value)
+    return number(f"{folder / META}: human.{name}", human.get(name))

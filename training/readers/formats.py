@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import mmap
 import zipfile
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from typing import Any
 
 from warpgarment.errors import MeshError
 from warpgarment.io.pc2 import HEADER, SIGNATURE
+from warpgarment.io.plain import open_plain, read_json
 
 from . import cloth3d, dlayers
 from .cloth3d import read_cloth3d
@@ -80,8 +80,8 @@ def _folder(path: Path) -> str | None:
         return "cloth3d"
     if (path / dlayers.META).is_file():
         try:
-            meta = json.loads((path / dlayers.META).read_text("utf-8"))
-        except (ValueError, RecursionError):
+            meta = read_json(path / dlayers.META)
+        except MeshError:
             return "dlayers"  # its reader reports the fault
         parts = [meta, meta.get("simulate")] if isinstance(meta, dict) else []
         return "dlayers" if any(isinstance(part, dict) and "garment" in part for part in parts) else None
@@ -89,7 +89,7 @@ def _folder(path: Path) -> str | None:
 
 
 def _file(path: Path) -> str | None:
-    with open(path, "rb") as file:
+    with open_plain(path) as file:
         head = file.read(HEADER.size)
     if head.startswith(SIGNATURE[:11]):
         return _point_cache(path, head)

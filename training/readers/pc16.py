@@ -13,6 +13,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.pc2 import HEADER, SIGNATURE
+from warpgarment.io.plain import open_plain
 
 
 def read_pc16(path: str | Path) -> np.ndarray:
@@ -24,7 +25,7 @@ def read_pc16(path: str | Path) -> np.ndarray:
     """
     path = Path(path)
     size = path.stat().st_size
-    with open(path, "rb") as file:
+    with open_plain(path) as file:
         head = file.read(HEADER.size)
     if len(head) < HEADER.size or not head.startswith(SIGNATURE[:11]):
         raise MeshError(f"{path}: does not start with POINTCACHE2; this is not a PC16 file, or it is cut short.")

@@ -31,6 +31,7 @@ from warpgarment.errors import MeshError
 from warpgarment.io.files import read_mesh
 from warpgarment.io.npz import read_npz, write_npz
 
+from .fields import betas, numbers
 from .recording import Recording, recorded_garment
 from .smpl import BodySource, SmplPoses, body_from
 from .unpickle import read_pickle
@@ -73,7 +74,7 @@ def read_vto(
         if len(still) != frames.shape[1]:
             raise MeshError(f"{rest} has {len(still):,} vertices, the garment of {path.name} {frames.shape[1]:,}.")
     elif "rest_vertices" in data:
-        still = data["rest_vertices"]
+        still = numbers(f"{path}: rest_vertices", data["rest_vertices"], (2,))
     else:
         still = frames[0]
         warnings.warn(f"{path}: {NO_REST}. Give one with rest=.", UserWarning, stacklevel=2)
@@ -163,9 +164,6 @@ def _poses(path: Path, data: Mapping[str, Any], frames: int) -> SmplPoses | None
             f"{path}: {frames:,} frames of the garment, {names['pose']} {list(pose.shape)} and translation "
             f"{list(trans.shape)}: they must be [T,72] and [T,3]."
         )
-    betas = data.get(names["shape"], np.zeros(10)) if names["shape"] else np.zeros(10)
-    betas = np.asarray(betas, dtype=np.float64)
-    if betas.ndim == 2 and (betas == betas[:1]).all():
-        betas = betas[0]
+    shape = betas(f"{path}: {names['shape']}", data[names["shape"]], frames) if names["shape"] else np.zeros(10)
     rotations = pose.astype(np.float64).reshape(frames, 24, 3)
-    return SmplPoses(rotations, trans.astype(np.float64), betas, "female", FPS, up="y", source=str(path))
+    return SmplPoses(rotations, trans.astype(np.float64), shape, "female", FPS, up="y", source=str(path))

@@ -1,9 +1,36 @@
-"""Tables in Markdown."""
+"""Tables in Markdown, and text of others that is to be shown as text."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
+
+_SPECIAL = re.compile(r"[\\`*{}~|$#]|!(?=\[)|\](?=[(\[:])|(?<![^\W_])_|_(?![^\W_])")
+
+
+def escape(text: object) -> str:
+    """Text of someone else as Markdown that shows it as it is: no tag, link, picture, emphasis or cell comes of it.
+
+    Args:
+        text: What to show, converted by `str`. Line breaks and other control characters become spaces.
+    """
+    plain = " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
+    plain = plain.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    plain = _SPECIAL.sub(lambda match: f"\\{match[0]}", plain)
+    return plain.replace("://", "&#58;//").replace("www.", "www&#46;").replace("@", "&#64;")
+
+
+def code(text: object) -> str:
+    """Text of someone else as a code span, which shows it as it is, in one line.
+
+    Args:
+        text: What to show, converted by `str`.
+    """
+    plain = " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
+    fence = "`" * (1 + max((len(run) for run in re.findall("`+", plain)), default=0))
+    space = " " if plain.startswith("`") or plain.endswith("`") else ""
+    return f"{fence}{space}{plain}{space}{fence}"
 
 
 def table(header: Sequence[Any], rows: Iterable[Sequence[Any]], text: int | Collection[str] = 1) -> list[str]:
