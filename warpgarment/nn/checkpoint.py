@@ -24,6 +24,7 @@ from warpgarment.nn.faces.network import build_network
 
 from . import hub, shards
 from .config import NetworkConfig
+from .device import device_of
 from .network import STATISTICS, GarmentNetwork
 
 KIND = "warpgarment.network"
@@ -169,7 +170,7 @@ def _shipped() -> dict[str, Path]:
 
 
 def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
-    gpu = torch.cuda.is_available() if device is None else torch.device(device).type != "cpu"
+    gpu = device_of(device).type != "cpu"
     if gpu and "base" in ships:
         return "base"
     pointer = WEIGHTS / "default.txt"
