@@ -15,7 +15,6 @@ from warpgarment.view import draw
 
 from .outputs import check_output
 
-
 SMALLEST, MOST_PIXELS = 16, 16_000_000  # sides and area of a picture: drawing takes about 100 bytes a pixel
 
 
