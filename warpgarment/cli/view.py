@@ -74,9 +74,8 @@ def _check_picture(options: View) -> None:
             f"--size {width} {height}: both must be at least {SMALLEST}, and there may be {MOST_PIXELS:,} pixels."
         )
     if options.frames < 1 or options.frames * width * height > 16 * MOST_PIXELS:
-        raise UsageError(
-            f"--frames {options.frames}: at least 1, and with this --size at most {16 * MOST_PIXELS // (width * height):,}."
-        )
+        most = 16 * MOST_PIXELS // (width * height)
+        raise UsageError(f"--frames {options.frames}: at least 1, and with this --size at most {most:,}.")
     if not math.isfinite(options.azimuth):
         raise UsageError(f"--azimuth {options.azimuth}: an angle in degrees is needed.")
 
