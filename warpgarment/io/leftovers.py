@@ -54,18 +54,19 @@ def finished(*paths: Path) -> None:
     _mine.difference_update(path.name for path in paths)
 
 
-def remove_leftovers(folder: Path, back: Path | None = None) -> None:
+def remove_leftovers(folder: Path, back: Path | None = None, old: float = OLD) -> None:
     """Removes what processes that were killed have left in a folder, as far as that is allowed.
 
     Args:
         folder: The folder of an output.
         back: An output that is a folder: where it is missing and was moved aside, it is put back.
+        old: Seconds without a change after which that of another machine, or of nobody in particular, goes.
     """
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         found = [(entry, match) for entry in entries if (match := _NAME.fullmatch(entry.name))]
         for entry, match in found:
             with contextlib.suppress(OSError):
-                if not _left(entry, match):
+                if not _left(entry, match, old):
                     continue
                 if match["kind"] == "aside":
                     if back is None or match["stem"] != back.stem[:_LONGEST]:
@@ -81,12 +82,12 @@ def remove_leftovers(folder: Path, back: Path | None = None) -> None:
                     os.unlink(entry.path)
 
 
-def _left(entry: os.DirEntry[str], match: re.Match[str]) -> bool:
+def _left(entry: os.DirEntry[str], match: re.Match[str], old: float) -> bool:
     """Whether nobody writes there any more."""
     if match["place"] == _place() and os.name == "posix":
         process = int(match["process"])
         return entry.name not in _mine if process == os.getpid() else not _lives(process)
-    return time.time() - entry.stat(follow_symlinks=False).st_mtime > OLD
+    return time.time() - entry.stat(follow_symlinks=False).st_mtime > old
 
 
 def _lives(process: int) -> bool:
