@@ -11,6 +11,7 @@ import tyro
 
 from warpgarment.errors import UsageError
 from warpgarment.io.atomic import atomic_file
+from warpgarment.io.outputs import check_writable
 
 
 @dataclass
@@ -100,6 +101,8 @@ def _import(options: Import) -> None:
 def _verify(options: Verify) -> None:
     from warpgarment.training.data.verify import VerificationFailed, verify
 
+    if options.json is not None:
+        check_writable(options.json)
     report = verify(options.root)
     print(report)
     if options.json is not None:

@@ -21,6 +21,8 @@ from types import TracebackType
 import torch
 import torch.distributed as dist
 
+from warpgarment.nn.device import device_of
+
 PATIENCE = timedelta(hours=2)  # limit of a wait; the other processes wait while the first one validates
 FRESH = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
 
@@ -47,7 +49,9 @@ class Group:
 
     def __init__(self, device: str | None = None) -> None:
         self.rank, self.size = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.device = device_of(device)
+        if self.size > 1 and self.device.type == "cuda" and torch.device(device or "cuda").index is None:
+            self.device = torch.device("cuda")  # `_join` gives each process its own
         if self.size > 1:
             self._join()
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgarment.io.outputs import check_writable
 from warpgarment.io.usd import write_usd
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
@@ -117,7 +118,9 @@ def run(
     from warpgarment.sim.simulator import Simulator
 
     began = time.perf_counter()
-    out, bundle = Path(out), assets(folder)
+    out = Path(out)
+    check_writable(out, folder=True)
+    bundle = assets(folder)
     simulator = Simulator.from_pretrained(weights, device=device)
     simulator.timings.synchronise = True
     print(f"demo on {simulator.device}, network {weights!r}")

@@ -30,3 +30,7 @@ class MissingExtra(ImportError):
 
 class UsageError(ValueError):
     """Options that parse but do not fit each other or the files they name."""
+
+
+class OutputError(OSError):
+    """An output that cannot be written: the disk is full or read-only, the name is not possible, an encoder failed."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 
 
@@ -117,7 +119,6 @@ def test_convert_keeps_positions(scene) -> None:
 
 def test_an_animation_becomes_part_of_a_data_set(scene, capsys) -> None:
     """Own simulations in other units cannot be trained on, or become a hundred times too large. 16-bit: 1e-5 m."""
-    from warpgarment.objects.garment import Garment
     from warpgarment.training.data.sequence import Sequence
 
     rest = Garment.load(scene / "band.obj", unit="cm")
@@ -208,6 +209,106 @@ def test_missing_extras_are_named(scene, capsys, monkeypatch) -> None:
 
     monkeypatch.setattr(generate, "generate", without_newton)
     assert 'pip install "warpgarment[physics]"' in _error(capsys, "generate", "--out", scene / "data")
+
+
+WRONG = [
+    "simulate BAND BODY --out OUT --device cpu --unit yard",
+    "simulate BAND BODY --out OUT --unit cm --device cpu --frames 0",
+    "simulate BAND BODY --out OUT --device gpu",
+    "simulate BAND BODY --out OUT --device cuda:99",
+    "simulate BAND BODY --out OUT --device mps",
+    "bench --device cuda:-2",
+    "doctor --device tpu",
+    "demo --out BAND --device cpu",
+    "convert BODY DIR/sh.v1",
+    "convert BODY BAND/x.npz",
+    "convert BODY OUT --body-unit cm --unit ell",
+    "convert BODY OUT --unit ell",
+    "view BODY --out DIR/a.png --size 8 8",
+    "view BODY --out DIR/a.png --size 90000 2000",
+    "view BODY --out DIR/a.png --frames 100000000",
+    "view BODY --out DIR/a.mp4 --azimuth inf",
+    "view BODY --out BAND/a.png",
+    "evaluate --data DIR --out BAND/x --device cpu",
+    "dataset verify DIR --json BAND/x.json",
+]
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_mistakes_end_with_status_2(scene, capsys, line: str) -> None:
+    """A traceback for what people mistype, or a picture of nothing: the status is 2 and nothing was written."""
+    names = {"BAND": "band.obj", "BODY": "body.npz", "OUT": "out.npz", "DIR": "."}
+    before = sorted(scene.rglob("*"))
+    words = []
+    for word in line.split():
+        head, _, rest = word.partition("/")
+        words.append(str(scene / names[head] / rest) if head in names else word)
+    try:
+        status = cli.main(words)
+    except SystemExit as exit_:  # the parser's own
+        status = exit_.code
+    said = capsys.readouterr()
+    assert status == 2
+    assert said.err.strip()
+    assert "Traceback" not in said.err
+    assert "fault" not in said.err
+    assert sorted(scene.rglob("*")) == before
+
+
+def test_outputs_are_tried_before_the_simulation(scene, capsys, monkeypatch) -> None:
+    """Hours of simulation are thrown away at their end, for a name or for a package that is not installed."""
+    from warpgarment.sim.simulator import Simulator
+
+    monkeypatch.setattr(Simulator, "rollout", lambda *_, **__: pytest.fail("simulated"))
+    monkeypatch.setattr(Garment, "load", lambda *_, **__: pytest.fail("read"))
+    (scene / "full.v1").mkdir()
+    (scene / "full.v1" / "notes.txt").write_text("mine")
+    (scene / "c.obj").mkdir()
+    common = ["simulate", scene / "band.obj", scene / "body.npz", "--out"]
+    assert "notes.txt" in _error(capsys, *common, scene / "full.v1")
+    assert "c.obj" in _error(capsys, *common, scene / "c.pc2")
+    assert "slash" in _error(capsys, *common, scene / "a.v1")
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    assert 'pip install "warpgarment[usd]"' in _error(capsys, *common, scene / "a.USDA")
+
+
+def test_folders_of_any_name(scene) -> None:
+    """Versions of a shot, `sh010.v002`, cannot be written: a slash says that a folder is meant."""
+    assert cli.main(["convert", str(scene / "body.npz"), f"{scene}/sh.v1/"]) == 0
+    assert len(list((scene / "sh.v1").glob("frame_*.obj"))) == 5
+    assert cli.main(["convert", str(scene / "body.npz"), str(scene / "sh.v1")]) == 0
+
+
+def test_a_film_that_cannot_be_encoded_is_an_error(scene, capsys, monkeypatch) -> None:
+    """ffmpeg fails, at once or at the end, and `wrote film.mp4` is said of half a film where a whole one was."""
+    film, program = scene / "film.mp4", scene / "ffmpeg"
+    film.write_bytes(b"old")
+    for body in ("cat > /dev/null; echo Disk quota exceeded >&2; exit 3", "echo Unknown encoder >&2; exit 1", "exit 0"):
+        program.write_text(f"#!/bin/sh\n{body}\n")
+        program.chmod(0o755)
+        monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(program))
+        text = _error(capsys, "view", scene / "body.npz", "--size", "80", "96", "--out", film)
+        assert "OutputError" in text
+        assert film.read_bytes() == b"old"
+        assert not list(scene.glob(".*"))
+    assert "film" in text
+    program.unlink()
+    assert "cannot be started" in _error(capsys, "view", scene / "body.npz", "--size", "80", "96", "--out", film)
+
+
+def test_a_fault_of_the_program_says_so_and_keeps_its_traceback(scene, capsys, monkeypatch) -> None:
+    """A bug would pass for a mistake of the user, or nobody could find it: status 1, and a file with the traceback."""
+
+    def broken(*_, **__):
+        raise KeyError("no such thing")
+
+    monkeypatch.setattr(BodyMotion, "save", broken)
+    assert cli.main(["convert", str(scene / "body.npz"), str(scene / "out.npz")]) == 1
+    text = capsys.readouterr().err
+    assert "fault" in text
+    kept = Path(text.split("traceback is in ")[1].split("; ")[0].split(". Please")[0])
+    assert "in broken" in kept.read_text()
+    kept.unlink()
 
 
 def test_exit_status_of_the_installed_command(scene) -> None:

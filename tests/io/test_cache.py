@@ -142,3 +142,16 @@ def test_garments_keep_their_distances_on_disk(folder, monkeypatch):
         for a, b in zip(again.pooled_geodesics, pooled, strict=True):
             np.testing.assert_array_equal(a, b)
     np.testing.assert_allclose(moved.geodesics, 2 * distances, rtol=1e-5)
+
+
+def test_a_full_disk_is_no_error(folder):
+    """A disk without room would stop a simulation for the sake of a cache: the writer's own error is no OSError."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40, before[1]))
+    try:
+        ask(Counted())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(folder.iterdir()) == []

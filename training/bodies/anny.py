@@ -8,7 +8,9 @@ for every phenotype. Anny's first load takes minutes; the data used here are kep
 
 from __future__ import annotations
 
+import contextlib
 import os
+import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +27,10 @@ TEMPLATE_FACES = 6000
 PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # Anny is Z up and faces -Y
 _CACHE_VERSION = 2
+_TEMPLATE = (
+    "faces", "corners", "barycentric", "hole_loops", "hole_lengths", "bone_indices", "bone_weights", "bone_names",
+    "bone_parents",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,9 +139,8 @@ def sampled_phenotype(rng: np.random.Generator) -> dict[str, float]:
 class AnnyBodies:
     """Anny's shape space evaluated on the light template; made by :func:`anny_bodies`."""
 
-    def __init__(self, cache: Path):
-        with np.load(cache, allow_pickle=False) as data:
-            self._data = {key: data[key] for key in data.files}
+    def __init__(self, data: dict[str, np.ndarray]):
+        self._data = data
         self._model = None
 
     def rest(self, **phenotype: float) -> RestBody:
@@ -190,9 +195,21 @@ def _evaluate(model: Any, phenotype: dict[str, float]) -> tuple[np.ndarray, np.n
 def anny_bodies() -> AnnyBodies:
     """Anny on the light template; the first call on a machine builds the cache (about two minutes)."""
     cache = cache_folder() / f"anny_template_{TEMPLATE_FACES}_v{_CACHE_VERSION}.npz"
-    if not cache.exists():
-        write_npz(cache, _build_template())
-    return AnnyBodies(cache)
+    data = _read_template(cache)
+    if data is None:
+        data = _build_template()
+        with contextlib.suppress(OSError):  # no room, no permission: it is only a cache
+            write_npz(cache, data)
+    return AnnyBodies(data)
+
+
+def _read_template(cache: Path) -> dict[str, np.ndarray] | None:
+    """The template from its cache; None where there is none, or it is not what was written (zip's CRCs)."""
+    try:
+        with np.load(cache, allow_pickle=False) as data:
+            return {key: data[key] for key in _TEMPLATE}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+        return None
 
 
 def _build_template() -> dict[str, np.ndarray]:

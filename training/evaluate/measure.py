@@ -24,6 +24,7 @@ import tyro
 
 from warpgarment.errors import MissingExtra
 from warpgarment.io.atomic import atomic_file
+from warpgarment.io.outputs import check_writable
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.tables.options import OptionMissing, TableName, TableOptions
@@ -108,6 +109,7 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         return make_table(config)
     if config.data is None or config.out is None:
         raise OptionMissing(f"an evaluation needs --{'data' if config.data is None else 'out'} FOLDER")
+    check_writable(Path(config.out) / "evaluation.json")
     path = checkpoint.find(config.network, device=config.device)
     simulator = Simulator(checkpoint.load(path), config.device)
     skipped: dict[str, str] = {}

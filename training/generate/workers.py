@@ -7,6 +7,11 @@ reported as lost, a new process takes its place, and all other work continues.
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -66,18 +71,47 @@ def spread(function: Callable[[Any], Any], items: Iterable[Any], processes: int)
 def _start(function: Callable[[Any], Any]) -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")
     near, far = context.Pipe()  # the ends of this process and of the new one
-    process = context.Process(target=_work, args=(function, far), daemon=True)
+    process = context.Process(target=_work, args=(function, far, os.getpid()), daemon=True)
     process.start()
     far.close()
     return near, process
 
 
-def _work(function: Callable[[Any], Any], connection: Connection) -> None:
+def end_with(parent: int) -> None:
+    """Makes this process end when its parent does, however that ends: a killed one says nothing to its children.
+
+    On Linux the kernel sees to it; it means the thread that started this process, which for `spread` lives as long as
+    the work. Elsewhere a thread looks every second, wherever a process that lost its parent gets another one.
+
+    Args:
+        parent: Number of the process that started this one.
+    """
+    if sys.platform == "linux":
+        import ctypes
+
+        PR_SET_PDEATHSIG = 1
+        if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0) == 0:
+            if os.getppid() != parent:  # it ended before this was asked for
+                os._exit(1)
+            return
+    if os.name != "posix":
+        return  # the pipe's end is noticed when the item is done
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="warpgarment-parent", daemon=True).start()
+
+
+def _work(function: Callable[[Any], Any], connection: Connection, parent: int) -> None:
+    end_with(parent)
     while True:
         try:
             item = connection.recv()
         except EOFError:
-            return
+            return  # the parent has ended, or needs no more
         try:
             answer: tuple[Any, str | None] = (function(item), None)
         except Exception as error:

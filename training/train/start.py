@@ -24,6 +24,7 @@ from pathlib import Path
 import torch
 
 from warpgarment.io.atomic import atomic_file
+from warpgarment.io.leftovers import remove_leftovers
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import architecture, build_network
 from warpgarment.training.distributed import Group, GroupError
@@ -106,7 +107,6 @@ def _prepare(config: TrainConfig) -> None:
     """The out folder, without what a run that was killed left half written."""
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
-    for path in out.glob(".*.partial*"):
-        path.unlink()
+    remove_leftovers(out, old=0.0)
     with atomic_file(out / "config.json") as temporary:
         temporary.write_text(json.dumps(dataclasses.asdict(config), default=str, indent=2), "utf-8")

@@ -13,9 +13,8 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from warpgarment.errors import MeshError, UsageError
+from warpgarment.errors import MeshError
 
 _ROOM = "warpgarment"
 _EXTRAS = {
@@ -87,7 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Without the program's name; `sys.argv` by default.
 
     Returns:
-        The exit status: 0, or 2 where the user has to change something, which one line on stderr names.
+        The exit status: 0; 2 where the user has to change something, which one line on stderr names; 1 for a fault of
+        the program, where the line says in which file its traceback is kept.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
-            raise
+            return _own_up(error)
         from warpgarment.errors import MissingExtra
 
         return _complain(f"MissingExtra: {MissingExtra(extra, f'warpgarment {name}')}")
@@ -119,16 +119,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     except Exception as error:
         if not type(error).__module__.startswith(_ROOM):
-            raise  # not one of the errors that name a remedy: somebody has to see where it came from
+            return _own_up(error)  # not one of the errors that name a remedy
         return _complain(f"{type(error).__name__}: {error}")
     return 0
-
-
-def check_output(path: Path, suffixes: Sequence[str]) -> None:
-    """Refuses a file name that cannot be written, before time is spent on what goes into it."""
-    if path.suffix.lower() not in suffixes:
-        allowed = ", ".join(s or "a folder (no suffix)" for s in suffixes)
-        raise UsageError(f"cannot write {path.name!r}. Formats: {allowed}.")
 
 
 @contextlib.contextmanager
@@ -166,6 +159,26 @@ def _options(verb: Verb, name: str, arguments: Sequence[str]) -> object:
 
     config = getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.options)
     return tyro.cli(config, prog=f"warpgarment {name}", args=list(arguments), description=verb.summary)
+
+
+def _own_up(error: Exception) -> int:
+    """Keeps the traceback of a fault of the program in a file, and says in which."""
+    import tempfile
+    import traceback
+
+    text = "".join(traceback.format_exception(error))
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="warpgarment-fault-", suffix=".txt", encoding="utf-8", delete=False
+        ) as file:
+            file.write(f"warpgarment {' '.join(sys.argv[1:])}\n\n{text}")
+    except OSError:
+        print(text, file=sys.stderr, end="")  # nowhere to keep it
+        where = "its traceback is above"
+    else:
+        where = f"its traceback is in {file.name}"
+    _complain(f"a fault of the program, not of its input: {type(error).__name__}: {error}; {where}. Please report it.")
+    return 1
 
 
 def _complain(message: str) -> int:

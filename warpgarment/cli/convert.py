@@ -11,7 +11,8 @@ import tyro
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 
-from . import check_output, spoken
+from . import spoken
+from .outputs import Output, check_output
 
 
 @dataclass
@@ -20,7 +21,7 @@ class Convert:
 
     input: tyro.conf.Positional[Path]
     """Motion to read: .npz, .usd, .pc2 (with its .obj beside it), or a folder of .obj."""
-    output: tyro.conf.Positional[Path]
+    output: tyro.conf.Positional[Output]
     """Motion to write: .npz, .usd (.usda, .usdc), .pc2, or a folder of .obj."""
     fps: float | None = None
     """Resample to this rate; by default the rate stays."""

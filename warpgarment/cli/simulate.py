@@ -14,7 +14,8 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.view.report import rollout_table
 
-from . import check_output, spoken
+from . import spoken
+from .outputs import Output, check_output
 
 
 @dataclass
@@ -25,7 +26,7 @@ class Simulate:
     """Rest mesh of the garment, draped on the body's first frame (or see --fit-rest): .obj, .ply, .glb, .usd, .npz."""
     body: tyro.conf.Positional[Path]
     """Body motion: .npz, .usd, .pc2 with its .obj beside it, or a folder of .obj."""
-    out: Path
+    out: Output
     """Where to write: .usd, .pc2, .npz, or a folder of .obj (no suffix)."""
     weights: str = "default"
     """Network: a name that ships with the package, or a checkpoint file or folder."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,10 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.view import draw
 
-from . import check_output, spoken
+from . import spoken
+from .outputs import check_output
+
+SMALLEST, MOST_PIXELS = 16, 16_000_000  # sides and area of a picture: drawing takes about 100 bytes a pixel
 
 
 @dataclass
@@ -47,6 +51,7 @@ def run(options: View) -> None:
         raise UsageError("view was given no motion. Name at least one file.")
     if options.out is not None:
         check_output(options.out, (".png", ".mp4"))
+    _check_picture(options)
     with spoken(mesh="--mesh", fps="--fps"):
         loaded = [BodyMotion.load(path, mesh=options.mesh, fps=options.fps, collider=False) for path in options.motion]
     garments = [
@@ -70,6 +75,20 @@ def run(options: View) -> None:
         rows = [(", ".join(m.name for m in garments), garments, draw.PALETTE)]
         draw.sheet(options.out, body, rows, frames=options.frames, size=panel, camera=camera)
     print(f"wrote {options.out}")
+
+
+def _check_picture(options: View) -> None:
+    """Refuses pictures of no size, or so large that drawing them fills the memory."""
+    width, height = options.size
+    if min(options.size) < SMALLEST or width * height > MOST_PIXELS:
+        raise UsageError(
+            f"--size {width} {height}: both must be at least {SMALLEST}, and there may be {MOST_PIXELS:,} pixels."
+        )
+    if options.frames < 1 or options.frames * width * height > 16 * MOST_PIXELS:
+        most = 16 * MOST_PIXELS // (width * height)
+        raise UsageError(f"--frames {options.frames}: at least 1, and with this --size at most {most:,}.")
+    if not math.isfinite(options.azimuth):
+        raise UsageError(f"--azimuth {options.azimuth}: an angle in degrees is needed.")
 
 
 def _window(body: BodyMotion | None, garments: list[GarmentMotion]) -> None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from warpgarment.errors import OutputError
 
-def _beside(path: Path) -> Path:
-    """A hidden name in the same folder, hence file system, that keeps the suffix (USD's writer looks at it)."""
-    return path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}.partial{path.suffix}")
+from .leftovers import beside, finished, remove_leftovers
+
+# What a disk says that has no room, breaks, or may not be written to
+_REFUSED = {errno.ENOSPC, errno.EFBIG, errno.EROFS, errno.EIO, errno.ENAMETOOLONG, getattr(errno, "EDQUOT", errno.EIO)}
 
 
 def _flush(path: Path) -> None:
@@ -27,33 +29,58 @@ def _flush(path: Path) -> None:
 
 
 @contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Makes an OutputError, which names the output, of what a disk says while it is written."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        if error.errno in _REFUSED:
+            reason = error.strerror or str(error)
+        elif error.errno is None and "requested and" in str(error):
+            reason = f"no room on the disk ({error})"  # the words of ndarray.tofile, which keeps the number to itself
+        else:
+            raise
+        raise OutputError(f"{path}: cannot be written: {reason}. What was there before is as it was.") from error
+
+
+@contextlib.contextmanager
 def atomic_files(*paths: Path) -> Iterator[tuple[Path, ...]]:
     """Yields a temporary path for each target; on success all of them replace the targets, on any error none does.
 
     All files are complete and flushed before the first is renamed. They are renamed in the given order, so the one that
-    makes readers look for the others goes last.
+    makes readers look for the others goes last. What processes that were killed have left in the folders is removed.
 
     Args:
         paths: Where the files shall appear; parent folders are made.
+
+    Raises:
+        OutputError: The disk is full, or cannot be written to.
+        IsADirectoryError: A target is a folder.
     """
     paths = tuple(Path(path) for path in paths)
-    temporary = tuple(_beside(path) for path in paths)
-    for path in paths:
-        if path.is_dir():
-            raise IsADirectoryError(f"{path} is a folder. Choose another name for the file.")
-        path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield temporary
-        for path in temporary:
-            _flush(path)
-        for source, target in zip(temporary, paths, strict=True):
-            os.replace(source, target)
-    finally:
-        for path in temporary:
-            path.unlink(missing_ok=True)
-    for folder in {path.parent for path in paths}:
-        if os.name == "posix":
-            _flush(folder)
+    with _named(paths[-1]):
+        for path in paths:
+            if path.is_dir():
+                raise IsADirectoryError(f"{path} is a folder. Choose another name for the file.")
+            path.parent.mkdir(parents=True, exist_ok=True)
+        for folder in {path.parent for path in paths}:
+            remove_leftovers(folder)
+        temporary = tuple(beside(path) for path in paths)
+        try:
+            yield temporary
+            for path in temporary:
+                _flush(path)
+            for source, target in zip(temporary, paths, strict=True):
+                os.replace(source, target)
+        finally:
+            for path in temporary:
+                path.unlink(missing_ok=True)
+            finished(*temporary)
+        for folder in {path.parent for path in paths}:
+            if os.name == "posix":
+                _flush(folder)
 
 
 @contextlib.contextmanager
@@ -72,11 +99,29 @@ def _moved(source: Path, target: Path) -> bool:
     return True
 
 
+def check_replaceable(path: Path, replaces: str) -> None:
+    """Refuses a folder that `atomic_folder` would not replace.
+
+    Raises:
+        FileExistsError: The folder holds something else, or a file has its name.
+    """
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise FileExistsError(f"{path} is a file. Choose another folder.")
+    strangers = sorted(item.name for item in path.iterdir() if item.is_dir() or not item.match(replaces))
+    if strangers:
+        raise FileExistsError(
+            f"{path} holds {len(strangers):,} entries that are not {replaces} (first: {strangers[0]}) and would "
+            "be lost. Choose another folder."
+        )
+
+
 @contextlib.contextmanager
 def atomic_folder(path: Path, replaces: str, stays: Callable[[Path], bool] | None = None) -> Iterator[Path]:
     """Yields a temporary folder that takes the target's place on success and vanishes on any error.
 
-    An old folder is moved aside first and put back should the last rename fail.
+    An old folder is moved aside first and put back should the last rename fail, by the next save if need be.
 
     Args:
         path: Where the folder shall appear.
@@ -86,35 +131,31 @@ def atomic_folder(path: Path, replaces: str, stays: Callable[[Path], bool] | Non
 
     Raises:
         FileExistsError: The folder holds something else, or a file has its name.
+        OutputError: The disk is full, or cannot be written to.
     """
     path = Path(path)
-    if path.exists():
-        if not path.is_dir():
-            raise FileExistsError(f"{path} is a file. Choose another folder.")
-        strangers = sorted(item.name for item in path.iterdir() if item.is_dir() or not item.match(replaces))
-        if strangers:
-            raise FileExistsError(
-                f"{path} holds {len(strangers):,} entries that are not {replaces} (first: {strangers[0]}) and would "
-                "be lost. Choose another folder."
-            )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary, old = _beside(path), _beside(path)
-    temporary.mkdir()
-    try:
-        yield temporary
-        for item in temporary.iterdir():
-            _flush(item)
-        if stays is None or not (_moved(temporary, path) or stays(path)):
-            if path.exists():
-                os.replace(path, old)
-            try:
-                os.replace(temporary, path)
-            except OSError:
-                if old.exists():
-                    os.replace(old, path)
-                raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
-    if os.name == "posix":
-        _flush(path.parent)
+    with _named(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent, back=path)
+        check_replaceable(path, replaces)
+        temporary, old = beside(path), beside(path, aside=True)
+        try:
+            temporary.mkdir()
+            yield temporary
+            for item in temporary.iterdir():
+                _flush(item)
+            if stays is None or not (_moved(temporary, path) or stays(path)):
+                if path.exists():
+                    os.replace(path, old)
+                try:
+                    os.replace(temporary, path)
+                except OSError:
+                    if old.exists():
+                        os.replace(old, path)
+                    raise
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
+            finished(temporary, old)
+        if os.name == "posix":
+            _flush(path.parent)

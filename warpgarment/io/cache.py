@@ -65,7 +65,7 @@ def remembered(
             with atomic_file(path) as temporary:
                 save_file(arrays, temporary, metadata={"crc32": _checksum(arrays)})
             _forget_oldest(path.parent, prefix)
-        except OSError:
+        except (OSError, SafetensorError):
             pass  # no room, no permission: it is only a cache
     return arrays
 

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warpgarment.errors import UsageError
+
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 
@@ -102,10 +104,10 @@ def scale_of(unit: str | None) -> float:
     """Metres in a unit; 1 for None.
 
     Raises:
-        ValueError: An unknown unit.
+        UsageError: An unknown unit.
     """
     if unit is None:
         return 1.0
     if unit not in UNITS:
-        raise ValueError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
+        raise UsageError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
     return UNITS[unit]

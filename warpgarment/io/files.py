@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from warpgarment.errors import MeshError
+from warpgarment.errors import MeshError, UsageError
 
 from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
+from .outputs import names_folder
 from .parts import unnamed
 
 # Suffixes -> the module whose FORMAT reads and writes them; "" is a folder. docs/extending.md adds one.
@@ -148,31 +150,33 @@ def write_mesh(path: Path, data: MeshData) -> None:
         data: Positions in metres; pins are kept by .npz only.
 
     Raises:
-        ValueError: A suffix that is not written.
+        UsageError: A suffix that is not written.
     """
     format = _writer(Path(path), "write_mesh")
     assert format.write_mesh is not None
     format.write_mesh(Path(path), data)
 
 
-def write_motion(path: Path, data: MotionData) -> None:
+def write_motion(path: str | os.PathLike[str], data: MotionData) -> None:
     """Writes a moving mesh by suffix, as `GarmentMotion.save` describes, completely or not at all.
 
     Args:
-        path: The file, or a folder without a suffix; parent folders are made.
+        path: The file, or a folder: without a suffix, with a slash at its end, or one that exists; parent folders are
+            made.
         data: Positions in metres, with a rate; `extra` is kept by .npz only.
 
     Raises:
-        ValueError: A suffix that is not written.
+        UsageError: A suffix that is not written.
     """
-    format = _writer(Path(path), "write_motion")
+    plain = Path(str(path))
+    format = _writer(plain, "write_motion", folder=names_folder(path))
     assert format.write_motion is not None
-    format.write_motion(Path(path), data)
+    format.write_motion(plain, data)
 
 
 def _axis(up: str | None) -> str | None:
     if up not in (None, "y", "z"):
-        raise ValueError(f'up must be "y" or "z", got {up!r}')
+        raise UsageError(f'up must be "y" or "z", got {up!r}')
     return up
 
 
@@ -202,11 +206,14 @@ def _reader(path: Path, ability: Literal["read_mesh", "read_motion"], options: R
     raise MeshError(f"{path}: cannot read {kind}{' as a mesh' if ability == 'read_mesh' else ''}; use {listed(able)}.")
 
 
-def _writer(path: Path, ability: Literal["write_mesh", "write_motion"]) -> Format:
+def _writer(path: Path, ability: Literal["write_mesh", "write_motion"], folder: bool = False) -> Format:
     suffix, able = path.suffix.lower(), suffixes(ability)
+    if folder or (suffix not in able and "" in able and path.is_dir()):
+        suffix = ""
     format = format_of(suffix)
     if suffix not in able or format is None:
-        raise ValueError(f"cannot write {suffix or 'a file without a suffix'}; use {listed(able)}")
+        also = ", or a name with a slash at the end for a folder" if "" in able else ""
+        raise UsageError(f"cannot write {suffix or 'a file without a suffix'}; use {listed(able)}{also}")
     return format
 
 

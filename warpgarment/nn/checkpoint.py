@@ -25,6 +25,7 @@ from . import hub, shards
 from .architecture import ARCHITECTURES, architecture, build_network
 from .bounds import check_settings, checked_json
 from .config import STATISTICS, NetworkConfig
+from .device import device_of
 
 if TYPE_CHECKING:
     from .network import GarmentNetwork
@@ -181,7 +182,7 @@ def _shipped() -> dict[str, Path]:
 
 
 def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
-    gpu = torch.cuda.is_available() if device is None else torch.device(device).type != "cpu"
+    gpu = device_of(device).type != "cpu"
     if gpu and "base" in ships:
         return "base"
     pointer = WEIGHTS / "default.txt"

@@ -129,12 +129,12 @@ class BodyMotion:
         The output is written completely or not at all.
 
         Args:
-            path: File or folder to write; its suffix decides the format.
+            path: File or folder to write; its suffix decides the format. With a slash at the end it is a folder.
         """
         from warpgarment.io.data import MotionData
         from warpgarment.io.files import write_motion
 
-        write_motion(Path(path), MotionData(self.vertices, self.faces, self.fps, name=Path(path).stem or "body"))
+        write_motion(path, MotionData(self.vertices, self.faces, self.fps, name=Path(path).stem or "body"))
 
     def resampled(self, fps: float, frames: int | None = None) -> BodyMotion:
         """The motion at another rate, with positions interpolated linearly in time.

@@ -59,8 +59,8 @@ class GarmentMotion:
         - ``.npz``: positions, faces, rate, status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres;
         - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it;
-        - no suffix: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is replaced if it
-          holds nothing else.
+        - no suffix, or a slash at the end: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is
+          replaced if it holds nothing else.
 
         Args:
             path: File or folder to write; parent folders are made.
@@ -68,13 +68,14 @@ class GarmentMotion:
         Raises:
             ValueError: The suffix is not one of these.
             FileExistsError: The folder holds files that are not frames.
+            OutputError: The disk is full, or cannot be written to; what was there before stays.
             MissingExtra: The format is USD and the extra is not installed (``pip install "warpgarment[usd]"``).
         """
         from warpgarment.io.data import MotionData
         from warpgarment.io.files import write_motion
 
         name, extra = self.name or "garment", self._status_arrays()
-        write_motion(Path(path), MotionData(self.vertices, self.faces, self.fps, name=name, extra=extra))
+        write_motion(path, MotionData(self.vertices, self.faces, self.fps, name=name, extra=extra))
 
     @classmethod
     def load(

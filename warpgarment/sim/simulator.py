@@ -14,10 +14,11 @@ from typing import Any, overload
 import numpy as np
 import torch
 
-from warpgarment.errors import MeshError
+from warpgarment.errors import MeshError, UsageError
 from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.nn import checkpoint
+from warpgarment.nn.device import device_of
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.run import evaluating
 from warpgarment.objects.body import BodyMotion
@@ -70,9 +71,7 @@ class Simulator:
         half: bool = False,
         graph: bool | None = None,
     ) -> None:
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-        if self.device.type == "cuda" and self.device.index is None:
-            self.device = torch.device("cuda", torch.cuda.current_device())
+        self.device = device_of(device)
         if (epsilon is not None and not epsilon >= 0.0) or collision_passes < 0:
             raise ValueError(f"epsilon and collision_passes must not be negative, got {epsilon} and {collision_passes}")
         if graph and self.device.type != "cuda":
@@ -167,7 +166,7 @@ class Simulator:
         unique = list({id(b): b for b in bodies}.values())
         number = {id(b): i for i, b in enumerate(unique)}
         if frames is not None and frames < 1:
-            raise ValueError(f"frames must be at least 1, got {frames}")
+            raise UsageError(f"frames must be at least 1, got {frames}")
         motions = [b.resampled(self.network.config.fps, frames) for b in unique]
         known = self._known(garments, single, first_vertices, history)
         given = known.shape[0]

@@ -11,6 +11,8 @@ import numpy as np
 from warpgarment.errors import MissingExtra
 from warpgarment.io.atomic import atomic_file
 
+from .encoder import Encoder
+
 INK, MUTED = "#2f3640", "#77808c"
 
 
@@ -62,9 +64,12 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float = 30.0)
 
     Returns:
         Number of pictures.
+
+    Raises:
+        OutputError: ffmpeg cannot be started, or fails, as it does on a full disk; an old film stays.
     """
     with _needs_view():
-        import imageio_ffmpeg
+        from imageio_ffmpeg import get_ffmpeg_exe
     count, sink = 0, None
     with atomic_file(Path(path)) as temporary:
         try:
@@ -72,24 +77,16 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float = 30.0)
                 height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2  # 4:2:0 needs even sizes
                 image = np.ascontiguousarray(image[:height, :width])
                 if sink is None:
-                    sink = imageio_ffmpeg.write_frames(
-                        str(temporary),
-                        (width, height),
-                        fps=fps,
-                        codec="libx264",
-                        quality=None,
-                        macro_block_size=2,
-                        pix_fmt_out="yuv420p",
-                        output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
-                    )
-                    sink.send(None)
+                    sink = Encoder(get_ffmpeg_exe(), temporary, Path(path), (width, height), fps)
                 sink.send(image)
                 count += 1
-        finally:
+        except BaseException:
             if sink is not None:
-                sink.close()
-        if count == 0:
+                sink.abandon()
+            raise
+        if sink is None:
             raise ValueError("write_mp4 was given no frame; pass at least one")
+        sink.finish()
     return count
 
 

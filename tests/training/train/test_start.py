@@ -75,7 +75,7 @@ def test_killed_run_repeats_the_uninterrupted_one(data, whole, tmp_path):
     assert sorted(losses_of(tmp_path)) == list(range(1, 7))
     with (tmp_path / "log.jsonl").open("a") as file:
         file.write('{"step": 7, "lo')  # as if killed while it wrote
-    (tmp_path / ".state.0123.partial.safetensors").write_bytes(b"half")
+    (tmp_path / ".state.01234567.partial.safetensors").write_bytes(b"half")
     train.train(config_for(data, tmp_path, resume=True))
     assert losses_of(tmp_path) == losses_of(whole)
     assert not list(tmp_path.glob(".*"))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpgarment.errors import MeshError, MissingExtra
+from warpgarment.errors import MeshError, MissingExtra, OutputError
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
 from warpgarment.io.atomic import atomic_file
 
@@ -56,7 +57,7 @@ def write_usd(path: Path, meshes: Sequence[tuple[str, np.ndarray, np.ndarray]], 
     frames = {len(vertices) for _, vertices, _ in checked}
     if len(frames) > 1:
         raise MeshError(f"The meshes have {' and '.join(map(str, sorted(frames)))} frames. Give them the same number.")
-    with atomic_file(path) as temporary:
+    with atomic_file(path) as temporary, _said(path):
         stage = Usd.Stage.CreateNew(str(temporary))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -77,8 +78,21 @@ def write_usd(path: Path, meshes: Sequence[tuple[str, np.ndarray, np.ndarray]], 
                 points.Set(Vt.Vec3fArray.FromNumpy(positions), frame)
                 low, high = positions.min(axis=0), positions.max(axis=0)
                 extent.Set(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]), frame)
-        stage.GetRootLayer().Save()
+        if not stage.GetRootLayer().Save():
+            raise OutputError(f"{path}: USD could not save it. Is there room on the disk?")
         del stage
+
+
+@contextlib.contextmanager
+def _said(path: Path) -> Iterator[None]:
+    """Makes an OutputError of what USD's writer complains about."""
+    from pxr import Tf
+
+    try:
+        yield
+    except Tf.ErrorException as error:
+        said = "; ".join(str(entry.commentary) for entry in error.args) or str(error)
+        raise OutputError(f"{path}: USD cannot write it: {said}") from error
 
 
 def _identifier(name: str, taken: set[str]) -> str:
