@@ -15,31 +15,10 @@ from ._operator import allocate
 from ._torch import torch_stream
 from .body_meshes import BodyMeshes
 from .closest import Bodies
+from .nearest_face import closest_on_triangle
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
 """Below this distance [m] the direction from the closest point is noise, and the face's normal is taken."""
-
-
-@wp.func
-def closest_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
-    """The point of a triangle closest to p: the foot of the perpendicular if inside, or else on the nearest edge."""
-    n = wp.cross(b - a, c - a)
-    zero = wp.float64(0.0)
-    one = wp.float64(1.0)
-    outside = wp.int32(0)
-    best = a
-    for k in range(3):
-        start = wp.where(k == 0, a, wp.where(k == 1, b, c))
-        edge = wp.where(k == 0, b, wp.where(k == 1, c, a)) - start
-        if wp.dot(wp.cross(n, edge), p - start) < zero:
-            outside += 1
-        t = wp.clamp(wp.dot(p - start, edge) / wp.max(wp.dot(edge, edge), wp.float64(1e-300)), zero, one)
-        q = start + t * edge
-        if wp.length_sq(p - q) < wp.length_sq(p - best):
-            best = q
-    if outside == 0 and wp.length_sq(n) > zero:
-        best = p - n * (wp.dot(n, p - a) / wp.length_sq(n))
-    return best
 
 
 @wp.func

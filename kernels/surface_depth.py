@@ -28,7 +28,7 @@ from ._operator import allocate
 from ._torch import as_argument, expect, torch_stream
 from .body_meshes import BodyMeshes
 from .closest import Bodies, closest_on_body
-from .contacts import closest_on_triangle
+from .nearest_face import closest_on_triangle
 
 STANDS_OUT = wp.constant(0.01)
 """l [m]. Of what stands out further, vertices that are lower down are found; a bare spike is missed."""
