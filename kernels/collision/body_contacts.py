@@ -15,7 +15,8 @@ import warp as wp
 from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.closest import Bodies, closest_on_triangle
+from warpgarment.kernels.sdf.closest import Bodies
+from warpgarment.kernels.sdf.nearest_face import closest_on_triangle
 
 from .contact_set import ContactFrame, Contacts
 

@@ -1,10 +1,10 @@
 """The closest point of a body, and the side of it that a point is on.
 
-Manifold-aware transformers, section 4.2 (s_i) and supplement equation 2; formulas in query.py. The closest point comes
-from Warp's hierarchy of the body's faces, the sign from inside.py. Nothing of earlier frames is used: a perfect guess
-of the distance would shorten the search by a tenth only, and a result would then depend on more than its arguments. A
-limit on the distance shortens the search much more (`within`): contacts need no point that is further outside. Which
-face is named where several are equally near is decided in nearest_face.py.
+Manifold-aware transformers, section 4.2 (s_i) and supplement equation 2; formulas in query.py. The nearest face
+comes from Warp's hierarchy, its point from nearest_face.py in float64, the sign from inside.py. Nothing of earlier
+frames is used: a perfect guess of the distance would shorten the search by a tenth only, and a result would then
+depend on more than its arguments. A limit on the distance shortens the search much more (`within`): contacts need no
+point that is further outside. Which face is named where several are equally near is decided in nearest_face.py.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .inside import is_inside
-from .nearest_face import named_face, nearest_on_part, nearest_part
+from .nearest_face import corners_of, named_face, nearest_on_triangle
 
 MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its square is still a finite float32
 # Bodies in pieces: distance, in radii, from which a group of faces is summed as one. On closed bodies 1, 2 and 3 give
@@ -109,14 +109,12 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
                     v = deep.v
     if face < 0:
         return wp.where(reach < MAX_DISTANCE, BEYOND, NOTHING), sign, nowhere, wp.vec3d(nowhere)
-    weights = wp.vec3(u, v, 1.0 - u - v)
-    position = position_on(mesh, face, u, v)
+    # The search is in float32. Distances are flat around their minimum: where one is right to 1e-7 m, its point may be
+    # 1e-4 m off. So the point is computed again, on the face that is named.
     named = named_face(mesh, bodies.rings, bodies.face_offsets[b], face, point)
-    if named != face:  # the point of the named face that is nearest to the position, which usually is the position
-        part, _around = nearest_part(mesh, named, position)
-        coordinates, _distance = nearest_on_part(mesh, named, part, position)
-        weights = wp.vec3(coordinates)
-    return named, sign, weights, position
+    p, q, r = corners_of(mesh, named)
+    weights = nearest_on_triangle(wp.vec3d(point), p, q, r)
+    return named, sign, wp.vec3(weights), weights[0] * p + weights[1] * q + weights[2] * r
 
 
 @wp.kernel(enable_backward=False)
@@ -191,25 +189,3 @@ def query_bodies(
                 device=warp_device,
             )
     return distance, closest, face, barycentric
-
-
-@wp.func
-def closest_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
-    """The point of a triangle closest to p: the foot of the perpendicular if inside, otherwise on the nearest edge."""
-    n = wp.cross(b - a, c - a)
-    zero = wp.float64(0.0)
-    one = wp.float64(1.0)
-    outside = wp.int32(0)
-    best = a
-    for k in range(3):
-        start = wp.where(k == 0, a, wp.where(k == 1, b, c))
-        edge = wp.where(k == 0, b, wp.where(k == 1, c, a)) - start
-        if wp.dot(wp.cross(n, edge), p - start) < zero:
-            outside += 1
-        t = wp.clamp(wp.dot(p - start, edge) / wp.max(wp.dot(edge, edge), wp.float64(1e-300)), zero, one)
-        q = start + t * edge
-        if wp.length_sq(p - q) < wp.length_sq(p - best):
-            best = q
-    if outside == 0 and wp.length_sq(n) > zero:
-        best = p - n * (wp.dot(n, p - a) / wp.length_sq(n))
-    return best

@@ -27,6 +27,7 @@ import warp as wp
 
 from warpgarment.kernels.launch import expect, torch_stream
 from warpgarment.kernels.operator import allocate, launch
+from warpgarment.kernels.sdf.nearest_face import nearest_on_triangle
 
 from .bodies import BodyMeshes
 from .closest import query_bodies
@@ -40,7 +41,6 @@ def signed_distance_gradient_kernel(
     body_faces: wp.array[wp.vec3i],
     distance: wp.array[wp.float32],
     face: wp.array[wp.int32],
-    barycentric: wp.array[wp.vec3],
     grad_distance: wp.array[wp.float32],
     grad_closest: wp.array[wp.vec3],
     # Out:
@@ -55,7 +55,7 @@ def signed_distance_gradient_kernel(
     a = wp.vec3d(body_vertices[corner[0]])
     b = wp.vec3d(body_vertices[corner[1]])
     c = wp.vec3d(body_vertices[corner[2]])
-    weights = wp.vec3d(barycentric[i])
+    weights = nearest_on_triangle(wp.vec3d(points[i]), a, b, c)  # in float64: close to the face, less turns `away`
     away = wp.vec3d(points[i]) - (a * weights[0] + b * weights[1] + c * weights[2])
     length = wp.length(away)
     size = wp.max(wp.length(b - a), wp.length(c - a))
@@ -100,7 +100,6 @@ def _signed_distance_backward(
     body_faces: torch.Tensor,
     distance: torch.Tensor,
     face: torch.Tensor,
-    barycentric: torch.Tensor,
     grad_distance: torch.Tensor,
     grad_closest: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -115,7 +114,6 @@ def _signed_distance_backward(
             (body_faces, wp.vec3i),
             (distance, wp.float32),
             (face, wp.int32),
-            (barycentric, wp.vec3),
             (grad_distance, wp.float32),
             (grad_closest, wp.vec3),
         ],
@@ -132,7 +130,7 @@ def _(points: torch.Tensor, body_vertices: torch.Tensor, *rest: torch.Tensor) ->
 
 def _save(ctx: Any, inputs: tuple[torch.Tensor, ...], output: tuple[torch.Tensor, ...]) -> None:
     distance, _, face, barycentric = output
-    ctx.save_for_backward(*inputs, distance, face, barycentric)
+    ctx.save_for_backward(*inputs, distance, face)
     ctx.mark_non_differentiable(face, barycentric)
 
 

@@ -31,7 +31,8 @@ from warpgarment.kernels.launch import as_argument, expect, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import Bodies, closest_on_body, closest_on_triangle
+from .closest import Bodies, closest_on_body
+from .nearest_face import closest_on_triangle
 
 STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""

@@ -20,6 +20,13 @@ def unsigned_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarra
     return np.sqrt(np.maximum(squared, 0.0))
 
 
+def closest_point(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[N, 3], nearest points of the surface."""
+    return igl.point_mesh_squared_distance(
+        points.astype(np.float64), vertices.astype(np.float64), faces.astype(np.int64)
+    )[2]
+
+
 def signed_distance(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Signed distances [m], [N], negative where the winding number exceeds one half."""
     sign = np.where(winding_number(points, vertices, faces) > 0.5, -1.0, 1.0)

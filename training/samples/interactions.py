@@ -35,7 +35,7 @@ from warpgarment.kernels.features.face import BodyInteraction, body_interaction
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.training.rollouts import RecordedOnBody
 
-CACHE_VERSION = 2  # 1: over edges and vertices of the body, any of the nearest faces
+CACHE_VERSION = 3  # 1: over edges and vertices of the body, any of the nearest faces; 2: closest points 0.1 mm off
 MANIFEST = "manifest.json"
 _SOURCES = (
     "garment_rest_vertices", "garment_faces", "garment_vertices", "body_rest_vertices", "body_faces", "collider_faces",
