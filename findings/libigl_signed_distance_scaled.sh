@@ -4,7 +4,7 @@
 # Expected: signed_distance is plus or minus the distance to the surface, whatever decides the sign.
 # Seen:     with winding numbers, libigl's default, the distance is multiplied by 1 - 2w: where two parts of a body
 #           overlap (w = 2) it is three times too deep. With the fast approximation w is not an integer, and distances
-#           outside, too, are off (0.1 % two radii away). point-cloud-utils, which builds on libigl, does the same;
+#           outside, too, are off (0.03 % two radii away). point-cloud-utils, which builds on libigl, does the same;
 #           gpytoolbox, which builds on it too, and libigl's pseudo-normals do not.
 # Versions: libigl 2.6.3, point-cloud-utils 0.34.0, gpytoolbox 0.3.8, numpy 2.4.6.
 # So:       posed limbs overlap, and a depth of 5 mm in an armpit is reported as 15. Take the sign from one call and the

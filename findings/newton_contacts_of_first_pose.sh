@@ -7,7 +7,7 @@
 #           refit() does not know of it. Once the box is enlarged the contact is there.
 # Versions: newton 1.8.0, warp-lang 1.19.0, numpy 2.4.6.
 # So:       cloth falls through whatever leaves the box of the rest pose: raised arms, a step forward. Enlarge both
-#           arrays over the whole motion before the first step (training/teachers/_newton_model.py).
+#           arrays over the whole motion before the first step (training/teachers/newton/worlds.py).
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -8,7 +8,7 @@
 #           products with different kernels, and the unbatched one is made for a GPU.
 # Versions: warp-lang 1.19.0, scipy 1.17.1, numpy 2.4.6, on the CPU. The ratio is asserted (5 or more), not the times.
 # So:       wrap the matrix in a LinearOperator with batch_offsets where the CPU matters, or write the loop as one block
-#           of threads (kernels/cg.py). A profile of the matrix product alone does not show it.
+#           of threads (kernels/linear/conjugate_gradients.py). A profile of the matrix product alone does not show it.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

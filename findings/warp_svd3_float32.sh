@@ -7,7 +7,7 @@
 #           the singular values alone are better than the rotations. In mat33d the same call is exact to 1e-13.
 # Versions: warp-lang 1.19.0, numpy 2.4.6, on the CPU.
 # So:       whatever is put together again from U and V (strain limiting, polar decomposition) is off by a tenth of a
-#           percent, where cloth stretches by percents. Cast to mat33d first. See kernels/singular_values.py.
+#           percent, where cloth stretches by percents. Cast to mat33d first. See kernels/deformation/svd.py.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -10,7 +10,7 @@
 #           that do not touch. Distances stay right, so nothing shows.
 # Versions: warp-lang 1.19.0, numpy 2.4.6, on the CPU.
 # So:       give the flag, and one wp.Mesh per body with an array of ids rather than one mesh with groups. See
-#           kernels/closest.py and kernels/body_meshes.py.
+#           kernels/sdf/closest.py and kernels/sdf/bodies.py.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
