@@ -26,7 +26,7 @@ import torch
 
 from benchmarks.measure import RESULTS, Row, machine
 from benchmarks.networks import DEFAULT, named
-from warpgarment.io.atomic import atomic_files
+from warpgarment.io.disk.atomic import atomic_files
 
 from . import batch, frames, manifold, report, roofline, stages, teacher
 

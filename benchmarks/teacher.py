@@ -28,7 +28,7 @@ from benchmarks.batch import Rolling, scenes_of
 from benchmarks.measure import RESULTS, Row, figures, interleaved, machine
 from benchmarks.networks import Named
 from benchmarks.scenes import dressed
-from warpgarment.io.atomic import atomic_files
+from warpgarment.io.disk.atomic import atomic_files
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, TeacherError, make_teacher
 from warpgarment.view.markdown import table

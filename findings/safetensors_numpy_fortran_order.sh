@@ -7,7 +7,7 @@
 #           right norm, the wrong matrix. safetensors 0.7.0 wrote it correctly.
 # Versions: safetensors 0.8.0 (and 0.7.0 for comparison), scipy 1.17.1, numpy 2.4.6.
 # So:       body shape bases, skinning weights and anything transposed go through np.ascontiguousarray before saving
-#           (warpgarment/io/cache.py), and are compared after. Files that 0.8.0 wrote from such arrays are wrong for good.
+#           (warpgarment/io/disk/cache.py), and are compared after. Files that 0.8.0 wrote from such arrays are wrong for good.
 set -euo pipefail
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

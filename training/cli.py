@@ -10,8 +10,8 @@ from typing import Literal
 import tyro
 
 from warpgarment.errors import UsageError
-from warpgarment.io.atomic import atomic_file
-from warpgarment.io.outputs import check_writable
+from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.outputs import check_writable
 
 
 @dataclass

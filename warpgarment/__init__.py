@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from warpgarment.objects.motion import GarmentMotion
     from warpgarment.objects.status import RolloutStatus, Verdict
     from warpgarment.sim.simulator import Simulator
-    from warpgarment.view import draw
 
     from . import demo, kernels, metrics
     from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
     from .geometry import geodesics
     from .sim import memory
+    from .view import draw
 
     __version__: str
 

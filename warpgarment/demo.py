@@ -12,16 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgarment.io.outputs import check_writable
+from warpgarment.io.disk.outputs import check_writable
 from warpgarment.io.usd import write_usd
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
-from warpgarment.view import draw
 from warpgarment.view.report import rollout_table
 
 from . import metrics
 from .errors import MeshError
+from .view import draw
 
 ASSETS = Path(__file__).parent / "assets" / "demo"
 GARMENTS = ("dress", "tshirt")

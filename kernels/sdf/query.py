@@ -27,10 +27,10 @@ import warp as wp
 
 from warpgarment.kernels.launch import expect, torch_stream
 from warpgarment.kernels.operator import allocate, launch
-from warpgarment.kernels.sdf.nearest_face import nearest_on_triangle
 
 from .bodies import BodyMeshes
 from .closest import query_bodies
+from .nearest_face import nearest_on_triangle
 
 
 @wp.kernel(enable_backward=False)

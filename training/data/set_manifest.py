@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from warpgarment.errors import MeshError
-from warpgarment.io.atomic import atomic_file
-from warpgarment.io.plain import read_json
+from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import read_json
 from warpgarment.training.teachers import TEACHERS
 
 from .schema import SET, Kind, faults
@@ -108,7 +108,8 @@ def read_checked(path: Path, kinds: Mapping[str, Kind] | None) -> dict[str, Any]
         kinds: Kinds of the entries, of `schema`; None leaves them unchecked.
 
     Raises:
-        MeshError: The file is missing, no plain file, larger or more deeply nested than `io.plain` allows, or not a
+        MeshError: The file is missing, no plain file, larger or more deeply nested than `io.disk.plain` allows, or
+            not a
             JSON object, or an entry is of another kind; the error names it.
     """
     try:

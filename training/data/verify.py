@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.io.plain import open_plain
+from warpgarment.io.disk.plain import open_plain
 from warpgarment.view.report import table
 
 from .layout import SPLITS

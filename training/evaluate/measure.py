@@ -23,8 +23,8 @@ import numpy as np
 import tyro
 
 from warpgarment.errors import MissingExtra
-from warpgarment.io.atomic import atomic_file
-from warpgarment.io.outputs import check_writable
+from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.outputs import check_writable
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.tables.options import OptionMissing, TableName, TableOptions

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment.io.atomic import atomic_file, atomic_folder
+from warpgarment.io.disk.atomic import atomic_file, atomic_folder
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.sim.simulator import Simulator

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpgarment.errors import MissingExtra
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.training.data.sequence import Sequence as SequenceOnDisk

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
-from warpgarment.io.plain import open_plain
+from warpgarment.io.disk.plain import open_plain
 
 from .clip import Clip, checked_finite, frame_rate
 

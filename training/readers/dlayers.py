@@ -32,8 +32,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import below, read_json
 from warpgarment.io.npz import read_npz
-from warpgarment.io.plain import below, read_json
 
 from .axes import y_up
 from .blender_cloth import blender_material, mass_ratio, wind_speed

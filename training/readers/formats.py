@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import open_plain, read_json
 from warpgarment.io.pc2 import HEADER, SIGNATURE
-from warpgarment.io.plain import open_plain, read_json
 
 from . import cloth3d, dlayers
 from .cloth3d import read_cloth3d

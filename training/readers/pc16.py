@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import open_plain
 from warpgarment.io.pc2 import HEADER, SIGNATURE
-from warpgarment.io.plain import open_plain
 
 
 def read_pc16(path: str | Path) -> np.ndarray:

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 import warpgarment
-from warpgarment.io.atomic import atomic_folder
+from warpgarment.io.disk.atomic import atomic_folder
 from warpgarment.kernels.deformation.gradients import face_centroids
 from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.training.data.set_manifest import package_versions
 from warpgarment.view.markdown import table
 

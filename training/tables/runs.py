@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from warpgarment.errors import CheckpointError
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.nn import checkpoint
 from warpgarment.training.data.sequence import read_manifest
 from warpgarment.training.train.config import TrainConfig

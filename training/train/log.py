@@ -9,7 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 
 
 class RunLog:

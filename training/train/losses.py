@@ -15,7 +15,8 @@ from typing import Literal, NamedTuple
 
 import torch
 
-from warpgarment.nn.network import GarmentNetwork, NormalisedOutput
+from warpgarment.nn.inputs import NormalisedOutput
+from warpgarment.nn.network import GarmentNetwork
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import torch
 
-from warpgarment.io.atomic import atomic_file
-from warpgarment.io.leftovers import remove_leftovers
+from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.leftovers import remove_leftovers
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import architecture, build_network
 from warpgarment.training.distributed import Group, GroupError

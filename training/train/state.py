@@ -15,7 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from warpgarment.errors import CheckpointError
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.nn.network import GarmentNetwork
 
 

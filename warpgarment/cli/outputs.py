@@ -11,10 +11,10 @@ from typing import Annotated
 import tyro
 
 from warpgarment.errors import MissingExtra, UsageError
-from warpgarment.io.atomic import check_replaceable
+from warpgarment.io.disk.atomic import check_replaceable
+from warpgarment.io.disk.outputs import check_writable, names_folder
 from warpgarment.io.files import format_of
 from warpgarment.io.folder import FRAME
-from warpgarment.io.outputs import check_writable, names_folder
 
 _MODULES = {"usd": ("pxr",), "view": ("imageio", "imageio_ffmpeg", "PIL")}  # what an extra brings
 
@@ -51,7 +51,7 @@ def check_output(path: Path, suffixes: Sequence[str]) -> None:
 
     Raises:
         UsageError: No such format.
-        OutputError, FileExistsError: The name or the folder, see `io.outputs`.
+        OutputError, FileExistsError: The name or the folder, see `io.disk.outputs`.
         MissingExtra: What writes it is not installed.
     """
     plain = Path(str(path))

@@ -77,7 +77,7 @@ class Format(NamedTuple):
     (indices in range, finite positions) by the objects made of them. A mesh is also a motion of one frame: a format
     whose motions are nothing more leaves `read_motion` out.
 
-    The functions that write get metres, and make the file appear completely or not at all (see `io.atomic`).
+    The functions that write get metres, and make the file appear completely or not at all (see `io.disk.atomic`).
 
     Attributes:
         extra: The extra of this package that brings what the format needs; None: nothing more is needed.

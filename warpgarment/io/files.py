@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 
 from warpgarment.errors import MeshError, UsageError
+from warpgarment.io.disk.outputs import names_folder
 
 from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
-from .outputs import names_folder
 from .parts import unnamed
 
 # Suffixes -> the module whose FORMAT reads and writes them; "" is a folder. docs/extending.md adds one.

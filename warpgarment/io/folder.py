@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.atomic import atomic_folder
 
-from .atomic import atomic_folder
 from .data import Format, MotionData, ReadOptions
 from .obj import chosen_polygons, obj_text, read_polygons
 from .polygons import triangulate_counts

@@ -15,8 +15,8 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
+from warpgarment.io.disk.atomic import atomic_file
 
-from .atomic import atomic_file
 from .data import Format, MeshData, MotionData, ReadOptions
 from .parts import ALL, Parts, named
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.atomic import atomic_file
 
-from .atomic import atomic_file
 from .data import Format, MeshData, ReadOptions
 from .parts import ALL, Parts, connected_pieces, listed, named, unconnected, used_only
 from .polygons import triangulate_counts

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.atomic import atomic_files
 
-from .atomic import atomic_files
 from .data import Format, MotionData, ReadOptions
 from .obj import chosen_polygons, obj_text, read_polygons
 from .parts import unnamed
@@ -64,7 +64,7 @@ def read_pc2(path: Path) -> PointCache:
 
 
 def write_pc2_to(path: Path, vertices: np.ndarray, *, start: float = 0.0, sampling: float = 1.0) -> None:
-    """Writes positions [T,V,3] to exactly this path; see `io.atomic` for how to make it appear at once.
+    """Writes positions [T,V,3] to exactly this path; see `io.disk.atomic` for how to make it appear at once.
 
     Args:
         path: The file.

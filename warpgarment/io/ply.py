@@ -8,8 +8,8 @@ from typing import Literal, TypeAlias, cast
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.atomic import atomic_file
 
-from .atomic import atomic_file
 from .data import Format, MeshData, ReadOptions
 from .polygons import triangulate_counts
 

@@ -19,7 +19,7 @@ import torch
 from safetensors.torch import save as serialise
 
 from warpgarment.errors import CheckpointError
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 
 from . import hub, shards
 from .architecture import ARCHITECTURES, architecture, build_network

@@ -24,7 +24,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 
 from warpgarment.errors import CheckpointError
-from warpgarment.io.atomic import atomic_folder
+from warpgarment.io.disk.atomic import atomic_folder
 
 SINGLE = "model.safetensors"  # where one file is enough; there is no index then
 INDEX = "model.safetensors.index.json"

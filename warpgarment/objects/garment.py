@@ -21,7 +21,7 @@ from warpgarment.geometry.checks import (
 )
 from warpgarment.geometry.clean import clean_mesh
 from warpgarment.geometry.orientation import agreeing
-from warpgarment.io.cache import remembered
+from warpgarment.io.disk.cache import remembered
 
 if TYPE_CHECKING:
     from warpgarment.geometry.pooled_geodesics import PooledGeodesics
@@ -177,7 +177,7 @@ class Garment:
     def geodesics(self) -> np.ndarray:
         """Distances over the surface between face centroids [m], float32, shape [F,F]; see `face_geodesics`.
 
-        From 1,000 faces on they are kept on disk; see `warpgarment.io.cache.remembered`.
+        From 1,000 faces on they are kept on disk; see `warpgarment.io.disk.cache.remembered`.
         """
         from warpgarment.geometry.geodesics import VERSION, face_geodesics
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from warpgarment.errors import NotEnoughMemory
-from warpgarment.kernels.collision.solver import compliance
+from warpgarment.kernels.collision import compliance
 from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.kernels.linear import factor
 from warpgarment.nn.architecture import architecture
@@ -29,8 +29,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies
 from warpgarment.objects.sizes import Sizes
-
-from .stages.correct import Corrector
+from warpgarment.sim.stages.correct import Corrector
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes: rest frames, indices; sparse matrices and vectors of the solvers

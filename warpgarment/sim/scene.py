@@ -22,14 +22,14 @@ from warpgarment.nn.parametrisation import Step
 from warpgarment.objects.clearance import clearance
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies, PackedGarments
+from warpgarment.sim.stages.centroids import ComponentCentroids
+from warpgarment.sim.stages.contact import Contact
+from warpgarment.sim.stages.correct import Correct, Corrector
+from warpgarment.sim.stages.features import Features
+from warpgarment.sim.stages.reconstruct import Reconstruct
 
 from . import memory
 from .bodies import MovingBodies
-from .stages.centroids import ComponentCentroids
-from .stages.contact import Contact
-from .stages.correct import Correct, Corrector
-from .stages.features import Features
-from .stages.reconstruct import Reconstruct
 from .surface import Surface
 from .timing import Timings
 

@@ -26,6 +26,7 @@ from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.pack import PackedBodies
 from warpgarment.objects.status import RolloutStatus
+from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
 from .arguments import as_array, counted, known_frames, listed, per_garment
@@ -34,7 +35,6 @@ from .graph import GraphedFrames
 from .history import History
 from .recording import READ_EVERY, Recording
 from .scene import Scene
-from .stages.correct import Corrector
 from .state import SimulationState, Status, Vertices
 from .timing import Timings
 

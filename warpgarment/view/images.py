@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.errors import MissingExtra
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 
 from .encoder import Encoder
 

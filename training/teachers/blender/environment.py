@@ -16,7 +16,7 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
-from warpgarment.io.cache import cache_folder
+from warpgarment.io.disk.cache import cache_folder
 from warpgarment.training.teachers import TeacherError
 
 PYTHON_VERSION = "3.11"

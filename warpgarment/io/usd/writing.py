@@ -12,7 +12,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError, MissingExtra, OutputError
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
-from warpgarment.io.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_file
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 

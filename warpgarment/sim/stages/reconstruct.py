@@ -9,7 +9,7 @@ import torch
 
 from warpgarment.kernels.deformation.next_frame import next_gradients
 from warpgarment.kernels.deformation.svd import replace_singular_values
-from warpgarment.kernels.features.face import LAYOUT
+from warpgarment.kernels.features.channels import LAYOUT
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn.inputs import VertexStep

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.surfaces import skirt
 
-from warpgarment.io import cache
+from warpgarment.io.disk import cache
 from warpgarment.objects.garment import Garment
 
 EXPECTED = {"a": ("float32", (3, None))}

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from warpgarment.errors import MeshError
-from warpgarment.io.plain import JSON_DEEPEST, JSON_LARGEST, below, open_plain, read_json
+from warpgarment.io.disk.plain import JSON_DEEPEST, JSON_LARGEST, below, open_plain, read_json
 
 
 def test_not_plain(tmp_path):

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from warpgarment.errors import MeshError, OutputError, UsageError
-from warpgarment.io import leftovers
-from warpgarment.io.atomic import atomic_file, atomic_folder
-from warpgarment.io.outputs import check_writable
+from warpgarment.io.disk import leftovers
+from warpgarment.io.disk.atomic import atomic_file, atomic_folder
+from warpgarment.io.disk.outputs import check_writable
 from warpgarment.objects.motion import GarmentMotion
 
 CLOTH = np.random.default_rng(1).normal(0, 1, (300, 30, 3)).astype(np.float32)
