@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from warpgarment.nn import checkpoint
     from warpgarment.nn.config import NetworkConfig
     from warpgarment.nn.faces.network import ManifoldAwareTransformer
     from warpgarment.nn.patches.network import PatchTransformer
@@ -39,6 +40,7 @@ __all__ = [
     "Simulator",
     "Verdict",
     "__version__",
+    "checkpoint",
     "demo",
     "draw",
     "fit",
@@ -66,6 +68,7 @@ _HOME = {
     "fit": "objects.fit",
 }
 _MODULES = {
+    "checkpoint": "nn.checkpoint",
     "demo": "demo",
     "draw": "view.draw",
     "geodesics": "geometry.geodesics",
