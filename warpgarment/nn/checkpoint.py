@@ -182,7 +182,8 @@ def _shipped() -> dict[str, Path]:
 
 
 def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
-    gpu = device_of(device).type != "cpu"
+    # which network ships for a kind of device; whether there is such a device is for who uses it
+    gpu = (torch.device(device) if device is not None else device_of(None)).type != "cpu"
     if gpu and "base" in ships:
         return "base"
     pointer = WEIGHTS / "default.txt"
