@@ -182,8 +182,11 @@ def _shipped() -> dict[str, Path]:
 
 
 def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
-    # which network ships for a kind of device; whether there is such a device is for who uses it
-    gpu = (torch.device(device) if device is not None else device_of(None)).type != "cpu"
+    # only the kind of device counts here: whether there is one is found out by who runs the network
+    if device is None:
+        gpu = torch.cuda.is_available()
+    else:
+        gpu = str(device).partition(":")[0] == "cuda" or device_of(device).type != "cpu"
     if gpu and "base" in ships:
         return "base"
     pointer = WEIGHTS / "default.txt"
