@@ -1,7 +1,7 @@
 """The simulator: garments on moving bodies, frame by frame (Algorithm 1).
 
-`rollout` takes whole motions, `start` and `step` take bodies as they come; both run the same code on a packed batch,
-and one garment is a batch of one.
+`rollout` takes whole motions, `start` and `step` take one body pose at a time. Both run the same code on a packed
+batch; one garment is a batch of one.
 """
 
 from __future__ import annotations
@@ -43,22 +43,22 @@ class Simulator:
     """Moves garments with a network.
 
     Args:
-        network: Moved to the device, and used in evaluation mode whatever mode it is in.
-        device: "cpu", "cuda", ...; None takes CUDA where there is any.
-        epsilon: Distance that collision refinement keeps between vertices and body [m]. None: 4 mm, or a fifth of a
-            garment's mean edge length if that is more, since a body shows through between the vertices of coarse cloth.
-        collision_passes: Collision refinement is repeated while anything of a garment is more than 0.1 mm deep, at most
-            so often per frame; 0 leaves it out.
-        half: Run the transformer in bfloat16: faster on recent GPUs. Geometry stays in float32.
-        graph: Replay frames as one CUDA graph, after the first few (`graph.py`). None: on CUDA, and a graph that
-            cannot be made is a RuntimeWarning. Off while `timings.synchronise` is set, which measures inside a frame.
+        network: The network. It is moved to the device, and runs in evaluation mode.
+        device: Device, "cpu", "cuda", ...; None takes a GPU if there is one.
+        epsilon: Distance that collision refinement keeps between vertices and body [m]. None takes 4 mm, or a fifth of
+            a garment's mean edge length if that is more, since a body shows through between the vertices of coarse
+            cloth.
+        collision_passes: Largest number of collision refinements per frame. They are repeated while any point of a
+            garment is more than 0.1 mm deep; 0 leaves them out.
+        half: Whether the transformer runs in bfloat16, which is faster on recent GPUs. Geometry stays in float32.
+        graph: Whether frames after the first few are replayed as one CUDA graph (`graph.py`). None does so on CUDA. A
+            graph that cannot be made is a RuntimeWarning. Frames are not replayed while `timings.synchronise` is set.
 
     Attributes:
-        timings: Seconds per stage since the simulator was made: a dict, plus `synchronise`, which must be set for it to
-            be filled on CUDA.
-        contact_sources: What finds contacts in the simulations that are started from now on: a list, at first
-            `[BodyContacts()]`.
-        correctors: What changes positions after contact, in order: a list, empty at first.
+        timings: Seconds per stage since the simulator was made, a dict. On CUDA, times are measured only while its
+            attribute `synchronise` is set.
+        contact_sources: List of contact sources for simulations that are started later, at first `[BodyContacts()]`.
+        correctors: List of correctors for simulations that are started later, in their order, at first empty.
     """
 
     def __init__(
@@ -92,10 +92,12 @@ class Simulator:
         Args:
             name: "default" (which depends on the device), the name of a network that ships, a checkpoint file, a folder
                 that holds one, or a Hugging Face repository `owner/name[@revision]` (extra `hub`).
-            device: As in the constructor, and so are the options.
+            device: Device, as in the constructor.
+            options: Further arguments of the constructor.
 
         Raises:
-            CheckpointError, MissingExtra: There is no such network, it is damaged, or cannot be fetched.
+            CheckpointError: There is no such network, it is damaged, or it cannot be fetched.
+            MissingExtra: The name can only be a repository, and huggingface-hub is not installed.
         """
         return cls(checkpoint.load(checkpoint.find(name, device=device)), device, **options)
 
@@ -138,28 +140,31 @@ class Simulator:
     ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
-        Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
-        network's rate. Garments whose motion is shorter stop earlier; one that stops being finite ends with that frame,
-        which holds NaN, with a status that says so and a RuntimeWarning.
+        Frame 0 is the garment as given, draped on the body's first frame and at rest. Bodies are resampled to the
+        network's rate. A garment whose motion is shorter stops earlier. A garment that stops being finite ends
+        with that frame, which holds NaN and has the verdict `NOT_FINITE`, and there is a RuntimeWarning.
 
         Args:
-            garment: One or a list.
-            body: One, on which all garments are, or a list with one for each garment (which may repeat).
+            garment: One garment, or a list.
+            body: One body for all garments, or a list with one for each garment (the same object may repeat).
             first_vertices: Positions in the first frame [m], shape [V,3] (or a list), where they differ from the rest
                 positions `garment.vertices`: see `wg.fit`.
-            history: Known first frames, shape [H,V,3] (or a list) with H the network's `history`, of the body's first H
-                frames. They are returned as they are, and the simulation goes on from them.
-            frames: Stop after so many frames, known ones included.
-            face_splits: Show the network so many interleaved subsets of the faces, one at a time: less time and memory.
-            progress: Show a progress bar.
+            history: Known positions in the first H frames [m], shape [H,V,3] (or a list), where H is the `history` of
+                the network's config. They are returned unchanged, and the simulation continues from them.
+            frames: Largest number of frames, known ones included; None for the whole motion.
+            face_splits: Number of interleaved subsets of the faces that the network sees one at a time. More subsets
+                take less time and memory.
+            progress: Whether to show a progress bar.
 
         Returns:
             A `GarmentMotion` at the network's rate, or a list of them for a list of garments.
 
         Raises:
-            ValueError: Lists of different lengths, arrays of other shapes, both `first_vertices` and `history`.
+            ValueError: Lists have different lengths, arrays have other shapes, or both `first_vertices` and `history`
+                are given.
             MeshError: A garment is more than 1 m from its body, or positions are not finite.
-            NotEnoughMemory: The batch would not fit on the device; names the setting with which it would.
+            NotEnoughMemory: The batch would not fit on the device; the message names settings with which it would.
+            UsageError: `frames` is less than 1.
         """
         garments, single = listed(garment, Garment)
         bodies = per_garment(body, BodyMotion, len(garments), "bodies")
@@ -229,17 +234,17 @@ class Simulator:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
         Args:
-            garment: One or a list.
-            body_vertices: The body in the first frame [m], shape [U,3]; a list, one for each garment, or one for all.
-            body_faces: Its faces, shape [G,3]; a list where `body_vertices` is one.
-            first_vertices: As in `rollout`.
-            face_splits: As in `rollout`.
+            garment: One garment, or a list.
+            body_vertices: Body in the first frame [m], shape [U,3], for all garments; or a list with one for each.
+            body_faces: Vertex indices of its faces, shape [G,3]; a list if `body_vertices` is one.
+            first_vertices: Positions in the first frame, as in `rollout`.
+            face_splits: Number of subsets of the faces, as in `rollout`.
 
         Returns:
             The state at frame 0.
 
         Raises:
-            ValueError, MeshError, NotEnoughMemory: As `rollout`.
+            ValueError, MeshError, NotEnoughMemory: As for `rollout`.
         """
         garments, single = listed(garment, Garment)
         if isinstance(body_vertices, (list, tuple)):
@@ -262,18 +267,18 @@ class Simulator:
     def step(
         self, state: SimulationState[Vertices, Status], next_body_vertices: Any
     ) -> SimulationState[Vertices, Status]:
-        """One frame on.
+        """Simulates the next frame.
 
         Args:
-            state: From `start` or `step`; stays as it is.
-            next_body_vertices: The body in the next frame [m], shape [U,3]; a list where `start` was given one. Copied.
+            state: A state from `start` or `step`; it is not changed.
+            next_body_vertices: Body in the next frame [m], shape [U,3]; a list if `start` was given one. It is copied.
 
         Returns:
-            The next state. Once a garment is not finite it stays so, and its vertices are NaN.
+            The next state. A garment that is not finite stays so, and its vertices are NaN.
 
         Raises:
-            ValueError: Another number of bodies or vertices than at the start.
-            MeshError: Positions that are not finite.
+            ValueError: The number of bodies or of their vertices differs from that at the start.
+            MeshError: Positions are not finite.
         """
         listed = isinstance(next_body_vertices, (list, tuple))
         arrays = [as_array(v) for v in (next_body_vertices if listed else [next_body_vertices])]
@@ -295,7 +300,7 @@ class Simulator:
         body_frames: list[torch.Tensor],
         face_splits: int,
     ) -> list[SimulationState[Any, Any]]:
-        """States of the known frames [K,V,3]: one for a cold start, H with a history."""
+        """States of the known frames `known` [K,V,3]; K is 1 for a cold start, H with a history."""
         scene = Scene(
             garments,
             bodies,
@@ -343,9 +348,9 @@ class Simulator:
         return torch.from_numpy(frames).to(self.device)
 
     def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
-        """Arrays [*,3] end to end on the device; always a copy, so that callers may reuse theirs.
+        """Concatenates arrays [*,3] on the device; always a copy, so that callers may reuse their arrays.
 
-        Pinned on the way to a GPU: from other memory the host would wait until all earlier work is done.
+        Copies to a GPU start from pinned memory; with other memory the host would wait for all earlier work.
         """
         packed = torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False))
         return packed.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else packed
