@@ -196,10 +196,10 @@ class Sequence:
 
 
 def read_array(folder: Path, name: str) -> np.ndarray:
-    """One array of a sequence, copied into memory unless it is of those that are large.
+    """One array of a sequence; large ones are memory-mapped, all others copied into memory.
 
     Raises:
-        MeshError: There is none, it is no plain file of one array, or it is larger than such an array may be.
+        MeshError: The file is missing, is not a plain file with one array, or is larger than such an array may be.
     """
     path = Path(folder) / f"{name}.npy"
     try:
@@ -220,8 +220,8 @@ def check_array_file(path: Path) -> None:
     """Checks that a file is a plain one with as many bytes as the array in its header needs; reads no more than that.
 
     Raises:
-        MeshError: It is another kind of file, or has other bytes.
-        OSError, ValueError: It cannot be read, or does not begin as a .npy file.
+        MeshError: It is another kind of file, or has another number of bytes.
+        OSError, ValueError: It cannot be read, or does not begin like a .npy file.
     """
     with open_plain(path) as file:
         version = np.lib.format.read_magic(file)
