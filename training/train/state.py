@@ -1,6 +1,6 @@
-"""The state of a training run in one safetensors file: weights, averaged weights, optimiser, pool, and where it stands.
+"""The state of a training run in one safetensors file: weights, averaged weights, optimiser, pool, and progress.
 
-Random numbers need no state: every step draws its own from (seed, step).
+Random numbers need no state: every step makes its own from (seed, step).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Average:
 
     Args:
         network: The network in training.
-        decay: Of the average; less at first, (1 + n) / (10 + n) after n updates.
+        decay: Decay per update; after n updates it is at most (1 + n) / (10 + n).
     """
 
     def __init__(self, network: GarmentNetwork, decay: float) -> None:
@@ -33,7 +33,7 @@ class Average:
 
     @torch.no_grad()
     def update(self, network: torch.nn.Module) -> None:
-        """Takes in the weights as they are now."""
+        """Adds the current weights to the average."""
         weight = 1.0 - min(self.decay, (1.0 + self.updates) / (10.0 + self.updates))
         self.updates += 1
         torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), weight)
@@ -49,7 +49,7 @@ def save(
     extra: dict[str, torch.Tensor],
     progress: dict[str, Any],
 ) -> None:
-    """Writes the state beside the path, flushes it and renames it: a run can always go on from a whole file."""
+    """Writes the state under a temporary name, flushes and renames it, so that the file `path` is always complete."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average.{k}": v for k, v in average.network.state_dict().items()}
     for index, values in optimizer.state_dict()["state"].items():
@@ -70,7 +70,7 @@ def load(
         The extra tensors, and the progress.
 
     Raises:
-        CheckpointError: The file is not a training state, or of another network.
+        CheckpointError: The file is not a training state, or is one of another network.
     """
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
