@@ -53,8 +53,8 @@ class UnrollConfig:
 
     Attributes:
         steps: Number of steps K in a row; 1 is one-step training, for which the other settings here have no effect.
-        position: Weight of the position loss [1/m]; 0 for none. At 2000 it is most of the loss. It is the error by which
-            rollouts are judged, while the other terms count every wrinkle.
+        position: Weight of the position loss [1/m]; 0 for none. At 2000 it is most of the loss. It is the error of
+            rollouts, while the other terms count every wrinkle.
         collision_passes: Largest number of collision refinements between steps; 0 for none. A rollout has up to four.
     """
 
