@@ -1,8 +1,8 @@
 """The contacts of a garment with a body: closest points and outward directions in float64. Symbols: solver.py.
 
-The nearest way out of a limb is the wrong one for a vertex that is past its middle: it leads through the limb. Where it
-is known from where a vertex comes, the way from there to the vertex is followed to the first face, and if the nearest
-surface looks the other way than that face, the contact is with that face.
+For a vertex that is past the middle of a limb, the nearest point of the surface is on the wrong side. If the origin of
+a vertex is known, the segment from the origin to the vertex is followed to the first face of the body. If that face
+and the nearest surface have opposite directions, the contact is with that face.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from warpgarment.kernels.sdf.nearest_face import closest_on_triangle
 from .contact_set import ContactFrame, Contacts
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
-"""Below this distance [m] the direction from the closest point is noise, and the face's normal is taken."""
+"""Below this distance [m] the direction from the closest point is noise, and the normal of the face is used."""
 
 
 @wp.func
 def entered(bodies: Bodies, b: int, origin: wp.vec3, end: wp.vec3) -> int:
-    """The face through which a way goes into a body, packed; -1 if it meets none first or comes out of one."""
+    """Packed index of the face by which a segment enters a body; -1 if its first hit is an exit, or there is none."""
     way = end - origin
     length = wp.length(way)
     if b < 0 or b >= bodies.meshes.shape[0] or not (length > 0.0 and wp.isfinite(length)):
@@ -46,7 +46,7 @@ def find_contacts(
     distance: wp.array[wp.float32],
     face: wp.array[wp.int32],
     body_of_vertex: wp.array[wp.int32],
-    origin: wp.array[wp.vec3],  # or nothing
+    origin: wp.array[wp.vec3],  # may be empty
     epsilon: wp.float64,
     # Out:
     closest: wp.array[wp.vec3d],
@@ -54,7 +54,7 @@ def find_contacts(
 ):
     """Closest points and outward directions at the vertices closer than epsilon, zero elsewhere.
 
-    The closest point is computed again in float64: of a direction over 0.1 mm, float32 leaves three digits.
+    The closest point is computed again in float64: in float32, a direction over 0.1 mm has three digits.
     """
     i = wp.tid()
     n = wp.vec3d()
@@ -82,7 +82,7 @@ def find_contacts(
                     wp.cross(wp.vec3d(bodies.vertices[corner[1]]) - a, wp.vec3d(bodies.vertices[corner[2]]) - a)
                 )
                 if wp.dot(outward, n) < wp.float64(0.0):
-                    u = p - wp.dot(outward, p - a) * outward  # any point of its plane does
+                    u = p - wp.dot(outward, p - a) * outward  # as good as any point of its plane
                     n = outward
     closest[i] = u
     normal[i] = n
@@ -98,21 +98,21 @@ def contacts(
     body_of_vertex: torch.Tensor | None = None,
     origin: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The set C: what a body query found closer than epsilon.
+    """The set C: contacts of the vertices that are closer to a body than epsilon.
 
     Args:
         vertices: Positions [m], float32 [V,3].
         distance: Signed distance [m], float32 [V], negative inside.
         face: Nearest body face, int32 [V].
         bodies: The bodies in the frame of `vertices`.
-        epsilon: Distance kept from the body [m].
-        body_of_vertex: Body of each vertex, int32 [V]; None where there is one body.
-        origin: Where each vertex comes from [m], float32 [V,3], outside the body or NaN: vertices inside are led back
-            to the side where they went in. None: they leave by the nearest way.
+        epsilon: Distance to keep from the body [m].
+        body_of_vertex: Body of each vertex, int32 [V]; None if there is one body.
+        origin: Origin of each vertex [m], float32 [V,3], outside the body or NaN: vertices inside are moved to the side
+            on which they entered. None moves them to the nearest point of the surface.
 
     Returns:
-        Closest points of the surface or, for vertices that are led back, of the plane of the face where they went in,
-        [m], and outward directions, float64 [V,3]; zero at vertices that are not in C.
+        Closest points [m] and outward directions, float64 [V,3], zero at vertices that are not in C. Closest points are
+        on the surface, or, for vertices moved to the side on which they entered, on the plane of the face of entry.
     """
     vertices = vertices.detach().contiguous()
     body_of_vertex = bodies.body_of("body_of_vertex", body_of_vertex, len(vertices))
@@ -139,7 +139,7 @@ def contacts(
 
 
 class BodyContacts:
-    """The contacts of garments with the bodies that they are on."""
+    """Source of the contacts of garments with their bodies."""
 
     name = "body"
 
@@ -148,10 +148,10 @@ class BodyContacts:
 
         Args:
             vertices: Positions [m], float32 [V,3].
-            frame: The bodies, who is on which, the distance to keep and where the vertices come from.
+            frame: Bodies, body of each vertex, distance to keep, and origins of the vertices.
 
         Returns:
-            Contacts without stencils, [V].
+            V contacts without stencils.
         """
         bodies, on_body, _, epsilon, origin = frame
         query = bodies.query(vertices.detach(), on_body, within=epsilon)
