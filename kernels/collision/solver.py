@@ -120,9 +120,9 @@ class CollisionSolver:
         return self._progress.iterations
 
     def summary(self) -> torch.Tensor:
-        """Report of the last refinement: iterations, number of components stopped by the limit, largest error of these [m].
+        """Report of the last refinement: iterations, number of components stopped by the limit, their largest error.
 
-        float64 [3] on the solver's device; does not wait for the solve.
+        float64 [3] on the solver's device, the error in metres; does not wait for the solve.
         """
         return self._progress.summary()
 
