@@ -1,4 +1,4 @@
-"""If these failed, bodies would be posed wrongly, or broken ones reach the distance queries, which take anything."""
+"""If these failed, bodies would be posed wrongly, or broken ones reach the distance queries, which check nothing."""
 
 import re
 

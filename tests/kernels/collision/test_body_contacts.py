@@ -48,7 +48,10 @@ def found(vertices: np.ndarray, bodies: BodyMeshes, owner: np.ndarray, origin: n
 
 
 def test_vertices_past_the_middle_are_led_back_to_where_they_went_in():
-    """A wrong face, side, body or point, against all ways tried with all faces. Two bodies, to mix up."""
+    """Contacts would be with a wrong face, side, body or point.
+
+    Against tests of all segments with all faces; two bodies.
+    """
     body, end, origin = posed()
     other = meshes.Mesh(body.vertices + np.float32([0.1, 0.0, 0.05]), body.faces)
     both = meshes.joined(body, other)
@@ -73,7 +76,10 @@ def test_vertices_past_the_middle_are_led_back_to_where_they_went_in():
 
 
 def test_an_unknown_or_useless_origin_changes_nothing():
-    """NaN, the vertex itself, a point inside the body: the nearest way out, to the last bit."""
+    """Origins that are NaN, the vertex itself or inside the body would change contacts.
+
+    Bit for bit those without origins.
+    """
     ball = meshes.icosphere(3, 0.3)
     bodies, owner = BodyMeshes(torch.tensor(ball.vertices), torch.tensor(ball.faces)), np.zeros(200)
     points = np.random.default_rng(0).uniform(-0.35, 0.35, (200, 3)).astype(np.float32)
@@ -96,7 +102,7 @@ def features_of(garment: meshes.Mesh, bodies: BodyMeshes, next_vertices: torch.T
 
 
 def test_carried_is_the_motion_of_a_rigid_body():
-    """Turned and shifted with the body, wherever the nearest face is: a transposed or misplaced feature."""
+    """A feature would be transposed or misplaced: vertices must turn and move with a rigid body, at any nearest face."""
     skirt, body = meshes.skirt(24, 8), meshes.icosphere(3, 0.3, (0.05, 0.8, 0.0))
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.2], [0.3, 0.0, -0.1], [-0.2, 0.1, 0.0]]))
     bodies = BodyMeshes(torch.tensor(body.vertices), torch.tensor(body.faces))
@@ -112,7 +118,10 @@ def test_carried_is_the_motion_of_a_rigid_body():
 
 
 def test_carried_is_its_formula():
-    """Against float64 NumPy on a posed body in motion; a vertex of no face is NaN."""
+    """Positions would not be those of the formula.
+
+    Against float64 NumPy on a moving body; NaN for a vertex without faces.
+    """
     skirt, body, later = meshes.skirt(24, 8), meshes.posed_body(0.0), meshes.posed_body(0.2)
     bodies = BodyMeshes(torch.tensor(body.vertices), torch.tensor(body.faces))
     features = features_of(skirt, bodies, torch.tensor(later.vertices))
@@ -135,9 +144,9 @@ def test_carried_is_its_formula():
 
 @pytest.mark.parametrize("remembers", [True, False])
 def test_a_limb_does_not_go_through_a_sheet(remembers):
-    """A limb 8 cm thick rises 5 cm a frame under a sheet that lies 1 cm above it: more than half its thickness.
+    """The sheet would end below the limb, which is 8 cm thick and rises 5 cm per frame from 1 cm below the sheet.
 
-    Left to the nearest way out, the sheet ends below; led back to where it went in, it is lifted.
+    With the nearest points alone it does; with the sides on which vertices entered, it is lifted.
     """
     rest, limb = meshes.sheet_and_limb()
     bodies = BodyMeshes(torch.tensor(limb.vertices), torch.tensor(limb.faces))

@@ -1,5 +1,4 @@
-"""The data of a run: what is bad is skipped, counted, with a reason, never fatal, never silent; the cache is by
-content."""
+"""The data of a run: bad sequences are skipped and counted, with a reason; cache folders depend on the content."""
 
 from __future__ import annotations
 

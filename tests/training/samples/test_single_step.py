@@ -235,7 +235,7 @@ def test_loss_is_the_weighted_sum_of_absolute_differences():
     "name", [n for n, f in inspect.getmembers(losses, inspect.isfunction) if f.__module__ == losses.__name__]
 )
 def test_types_of_losses_can_be_looked_up(name):
-    """A function's types name something that the file does not import: whoever asks for them gets a NameError."""
+    """A type in a signature is not imported, so that reading the annotations is a NameError."""
     assert "return" in typing.get_type_hints(getattr(losses, name))
 
 
