@@ -23,7 +23,7 @@ import torch
 
 
 class Kind(Enum):
-    """How a channel turns and mirrors, see above."""
+    """Behaviour of a channel under turns and mirrors, see the table above."""
 
     SCALAR = "scalar"
     VECTOR = "vector"

@@ -294,12 +294,12 @@ def face_features(
     be used for a slightly displaced garment.
 
     Args:
-        inverse_rest: From `deformation.inverse_rest_frames`, float32 [F, 3, 3].
+        inverse_rest: Result of `deformation.inverse_rest_frames`, float32 [F, 3, 3].
         vertices: Garment positions [m], float32 [V, 3].
         faces: Vertex indices, int32 [F, 3].
         garment_of_face: Garment of each face, int32 [F].
         garment_mean: Mean of the face centroids of each garment [m], float32 [B, 3].
-        interaction: From `body_interaction`.
+        interaction: Result of `body_interaction`.
 
     Returns:
         Features, float32 [F, 34]; columns as in `LAYOUT` (channels.py). Differentiable in vertices and garment_mean.

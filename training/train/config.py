@@ -101,7 +101,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.steps is None and self.time_limit is None:
-            raise ValueError("give steps or time_limit (minutes), so that the schedule knows its end")
+            raise ValueError("give steps or time_limit (minutes), which define the end of the schedule")
         if self.grow and self.init is None:
             raise ValueError("grow needs init, the network to grow")
         for name in ("batch_size", "splits", "validate_every", "save_every", "log_every", "statistics_batches"):

@@ -1,4 +1,4 @@
-"""What all networks have in common: statistics, rows of garments, one frame of a simulation, files.
+"""The base class of all networks: statistics, rows of garments, one frame of a simulation, files.
 
 Each kind of network defines `forward_normalised`, which maps normalised inputs to normalised outputs; run.py does
 everything around it. A network whose output is not one step per face also defines `layout` and `predict`. The meaning

@@ -68,7 +68,7 @@ class Contents:
             size = sum(tensor.nbytes for tensor in tensors.values())
             if size != self.total_size:
                 raise CheckpointError(
-                    f"{self.path}: {INDEX} speaks of {self.total_size:,} bytes, its shards hold {size:,}; {_AGAIN}"
+                    f"{self.path}: {INDEX} gives {self.total_size:,} bytes, its shards hold {size:,}; {_AGAIN}"
                 )
             if _digest(tensors) != self.metadata.get("digest"):
                 raise CheckpointError(
@@ -184,7 +184,7 @@ def _sharded(folder: Path) -> Contents:
             if tensor in holder:
                 raise CheckpointError(f"{folder}: {tensor} is in two shards, {holder[tensor]} and {name}; {_AGAIN}")
             if weight_map.get(tensor) != name:
-                told = f"says it is in {weight_map[tensor]}" if tensor in weight_map else "does not know it"
+                told = f"says it is in {weight_map[tensor]}" if tensor in weight_map else "does not list it"
                 raise CheckpointError(f"{folder}: {name} holds {tensor}, {INDEX} {told}; {_AGAIN}")
             holder[tensor], shapes[tensor] = name, shape
     absent = sorted(weight_map.keys() - holder.keys())

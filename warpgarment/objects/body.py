@@ -143,7 +143,7 @@ class BodyMotion:
 
         Args:
             fps: New frames per second.
-            frames: No more than so many of the new frames; None: all.
+            frames: Largest number of new frames; None for all.
 
         Raises:
             MeshError: The rate is not positive, or so much higher than the motion's that the frames would fill memory.

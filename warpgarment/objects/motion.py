@@ -98,7 +98,7 @@ class GarmentMotion:
             up: See `BodyMotion.load`.
 
         Raises:
-            MeshError: Not such a file.
+            MeshError: The file is not of its kind, is damaged, or has no rate.
             FileNotFoundError: There is no such file.
         """
         from warpgarment.io.files import rate_of, read_motion

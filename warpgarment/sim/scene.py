@@ -40,7 +40,7 @@ class Scene:
     """Garments, bodies, and the stages of a frame.
 
     Args:
-        garments: In the order of the batch.
+        garments: The garments, in the order of the batch.
         bodies: Topology of the bodies, and which garment is on which.
         body_vertices: Bodies in the first frame [m], packed, shape [U,3].
         first_vertices: Garments in the first frame [m], packed, shape [V,3].

@@ -23,7 +23,7 @@ class Surface:
     """Edges and faces of a batch, of which the depth is measured.
 
     Args:
-        garments: In the order of the batch.
+        garments: The garments, in the order of the batch.
         packed: The same garments, packed.
     """
 

@@ -102,7 +102,7 @@ def features_of(garment: meshes.Mesh, bodies: BodyMeshes, next_vertices: torch.T
 
 
 def test_carried_is_the_motion_of_a_rigid_body():
-    """A feature would be transposed or misplaced: vertices must turn and move with a rigid body, at any nearest face."""
+    """A feature would be transposed or misplaced: vertices must move with a rigid body, at any nearest face."""
     skirt, body = meshes.skirt(24, 8), meshes.icosphere(3, 0.3, (0.05, 0.8, 0.0))
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.2], [0.3, 0.0, -0.1], [-0.2, 0.1, 0.0]]))
     bodies = BodyMeshes(torch.tensor(body.vertices), torch.tensor(body.faces))

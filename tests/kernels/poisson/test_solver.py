@@ -295,8 +295,7 @@ def test_budget_of_the_factors_is_kept(way):
 
 
 def test_a_factor_that_cannot_be_trusted_is_not_used():
-    """Elimination would lose the solution of a nearly singular matrix, and garments would fly apart without a warning.
-    """
+    """Elimination would lose the solution of a nearly singular matrix, and garments fly apart without a warning."""
     rest = meshes.irregular_grid(9, 7)
     matrix = laplacian.cotangent_laplacian(rest.vertices, rest.faces)
     count, largest = len(rest.vertices), matrix.diagonal().max()
