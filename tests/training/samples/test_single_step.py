@@ -199,7 +199,7 @@ def test_joint_yaw_turns_the_sample(loaded):
 
 
 def test_noise_has_the_stated_size_and_spares_pins():
-    """Amplitudes off, or pinned vertices displaced. 15 %: 400 draws of a few dozen fields."""
+    """Amplitudes would be wrong, or pinned vertices displaced. 15 %: 400 draws of a few dozen fields."""
     vertices, faces = synthetic_sequences.tube(16, 12, 0.2, 0.0, 1.0)
     pins = np.arange(16)
     free = NoiseBasis(faces, np.zeros(len(vertices), int), np.zeros(0, int))
