@@ -29,7 +29,7 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
     Args:
         scene: The scene that the frames belong to.
         first: Number of the first frame.
-        frames: `Frame.outcome` of that frame and the following ones.
+        frames: `Frame.outcome` of this and the following frames.
     """
     positions, finite, depth, solves = (torch.stack(tensors).cpu().numpy() for tensors in zip(*frames, strict=True))
     found = []

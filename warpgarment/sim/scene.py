@@ -51,7 +51,7 @@ class Scene:
         half: Whether the transformer runs in bfloat16.
         timings: Times of the stages, to which each stage adds its own.
         contact_sources: Objects that find contacts, such as `BodyContacts()`.
-        correctors: Objects that change positions after contact.
+        correctors: What changes positions after contact.
 
     Attributes:
         contact_sources: List of contact sources; more may be appended before the first frame.

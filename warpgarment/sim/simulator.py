@@ -140,17 +140,17 @@ class Simulator:
     ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
-        Frame 0 is the garment as given, draped on the body's first frame and at rest. Bodies are resampled to the
-        network's rate. A garment whose motion is shorter stops earlier. A garment that stops being finite ends
-        with that frame, which holds NaN and has the verdict `NOT_FINITE`, and there is a RuntimeWarning.
+        Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
+        network's rate. Garments whose motion is shorter stop earlier; one that stops being finite ends with that frame,
+        which holds NaN, with a status that says so and a RuntimeWarning.
 
         Args:
             garment: One garment, or a list.
             body: One body for all garments, or a list with one for each garment (the same object may repeat).
             first_vertices: Positions in the first frame [m], shape [V,3] (or a list), where they differ from the rest
                 positions `garment.vertices`: see `wg.fit`.
-            history: Known positions in the first H frames [m], shape [H,V,3] (or a list), where H is the `history` of
-                the network's config. They are returned unchanged, and the simulation continues from them.
+            history: Known first frames, shape [H,V,3] (or a list) with H the network's `history`, of the body's first H
+                frames. They are returned as they are, and the simulation goes on from them.
             frames: Largest number of frames, known ones included; None for the whole motion.
             face_splits: Number of interleaved subsets of the faces that the network sees one at a time. More subsets
                 take less time and memory.
@@ -300,7 +300,7 @@ class Simulator:
         body_frames: list[torch.Tensor],
         face_splits: int,
     ) -> list[SimulationState[Any, Any]]:
-        """States of the known frames `known` [K,V,3]; K is 1 for a cold start, H with a history."""
+        """States of the known frames [K,V,3]: one for a cold start, H with a history."""
         scene = Scene(
             garments,
             bodies,
