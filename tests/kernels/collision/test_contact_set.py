@@ -62,7 +62,7 @@ def test_body_contacts_are_those_of_a_twin(each, remembers):
     touching, clear = (normal != 0).any(1), np.abs(distance - epsilon) > 1e-6
     assert np.array_equal((mine != 0).any(1)[clear], touching[clear])
     assert 30 < touching.sum() < 100
-    kept = found.distance.numpy() if each else found.distance
+    kept = found.distance.numpy()
     missing = kept - (mine * (end - found.anchor.numpy())).sum(1)
     compared = touching & clear & (np.abs(distance) > 1e-4)
     np.testing.assert_allclose(mine[compared], normal[compared], atol=1e-5)

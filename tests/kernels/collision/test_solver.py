@@ -203,7 +203,8 @@ def test_normals_at_the_surface_are_those_of_the_faces():
     points = torch.tensor(corners.mean(0) + offsets[:, None] * normal, dtype=torch.float32)
     bodies = body_of(body)
     query = bodies.query(points)
-    closest, normals = (a.numpy() for a in collision.contacts(points, query.distance, query.face, bodies, EPSILON))
+    normals, closest, *_ = collision.contacts(points, query.distance, query.face, bodies, EPSILON)
+    normals, closest = normals.numpy(), closest.numpy()
     np.testing.assert_allclose(normals[:5], np.tile(normal, (5, 1)), atol=1e-6)  # that of the face's float32 corners
     np.testing.assert_allclose(closest[:5], query.closest[:5], atol=1e-7)
     assert not normals[5].any()
@@ -250,7 +251,7 @@ def test_operator_passes_opcheck():
     rest, bodies = meshes.skirt(8, 3, waist=0.17), body_of(ellipsoid())
     vertices = torch.tensor(rest.vertices, requires_grad=True)
     query = bodies.query(vertices)
-    closest, normals = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
+    normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
     limit = torch.full((1,), 1e-6, dtype=torch.float64)
     arguments = (vertices, normals, closest, EPSILON, limit, solver_for(rest)._model, 100)
     torch.library.opcheck(torch.ops.warpgarment.collision_solve, arguments)
@@ -262,7 +263,7 @@ def test_many_lanes_give_the_same_result(monkeypatch, solver):
     rest, bodies = meshes.skirt(12, 4, waist=0.17), body_of(ellipsoid())
     solver, vertices = solver_for(rest, **SOLVERS[solver]), torch.tensor(rest.vertices, requires_grad=True)
     query = bodies.query(vertices)
-    closest, normals = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
+    normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
     limit = torch.full((1,), 1e-6, dtype=torch.float64)
 
     def solve():

@@ -15,6 +15,7 @@ from warpgarment.kernels.collision.contact_set import (
 )
 from warpgarment.kernels.collision.solver import CollisionSolver
 from warpgarment.kernels.features.carry import carried, face_at_each_vertex
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.bodies import MovingBodies
 from warpgarment.sim.surface import Surface, distance_to_keep
@@ -23,6 +24,10 @@ from warpgarment.sim.timing import Timings
 from .finite import keep_finite
 
 SHALLOW = 1e-4  # metres: collisions are repeated while anything of a garment is deeper
+STRAIGHT = 2
+"""How often, at the end, vertices that are still inside are placed outside without their neighbours."""
+CLEAR = 5e-4
+"""Distance from the surface at which they are placed [m]."""
 
 
 class Contact:
@@ -124,10 +129,38 @@ class Contact:
                 report = _together(report, self.solver.summary())
                 refined = torch.where(pending[owner][:, None], refined, vertices)
                 vertices, finite = keep_finite(self._packed, refined, vertices, finite)
+            if self._sources and self._passes:
+                vertices = self._out(vertices, bodies, pending, origin)
             if measure:
                 inside = self._surface.depth(vertices, bodies, on_body)
                 depth = torch.where(pending, inside.garments, depth)
         return vertices, finite, depth, report
+
+    def _out(
+        self, vertices: torch.Tensor, bodies: BodyMeshes, pending: torch.Tensor, origin: torch.Tensor | None
+    ) -> torch.Tensor:
+        """Places vertices that are still inside after the last pass outside, each by itself.
+
+        Near two parts of a body that are close together or overlap, neighbours pull a vertex from one into the other in
+        each pass.
+
+        Args:
+            vertices: Positions [m], shape [V,3].
+            bodies: The bodies in the same frame.
+            pending: Garments of which anything is inside, bool [B].
+            origin: Where the vertices come from, see `origin`.
+
+        Returns:
+            Positions [m], shape [V,3].
+        """
+        owner = self._packed.garment_of_vertex
+        for _ in range(STRAIGHT):
+            on_body = torch.where(pending[owner.long()], self._body_of_vertex, -1)
+            found = self._contacts(vertices, ContactFrame(bodies, on_body, owner, self._epsilon, origin))
+            missing = (found.normal * (found.anchor - vertices)).sum(1)
+            way = torch.where(missing > 0, missing + CLEAR, 0.0)
+            vertices = (vertices + way[:, None] * found.normal).float()
+        return vertices
 
     def depth(self, vertices: torch.Tensor, body: torch.Tensor) -> torch.Tensor:
         """Depth of the deepest point of each garment in its body [m], at least 0; [V,3], [U,3] -> [B]."""
