@@ -11,6 +11,7 @@ import tyro
 
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.clock import in_words
 from warpgarment.objects.garment import Garment
 from warpgarment.view.report import rollout_table
 
@@ -52,6 +53,9 @@ class Simulate:
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
     frames: int | None = None
     """Simulate only the first so many frames."""
+    out_fps: float | Literal["body", "network"] = "body"
+    """Frames per second of the result: those of the body, so that it lies in the shot frame by frame, a number, or those
+    of the network, which is asked for its own (30 a second) in any case. The first frame is at the body's first."""
 
 
 def run(options: Simulate) -> None:
@@ -73,11 +77,16 @@ def run(options: Simulate) -> None:
         whole = _body(options.body, options, collider=False)
         rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
-    motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, progress=sys.stderr.isatty())
-    motion.save(options.out)
+    rate = None if options.out_fps == "network" else options.out_fps
+    shown = sys.stderr.isatty()
+    motion = simulator.rollout(
+        garment, body, first_vertices=first, frames=options.frames, out_fps=rate, progress=shown
+    )
+    with spoken(fps="--out-fps"):
+        motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))
-    print(f"\nwrote {options.out}")
+    print(f"\nwrote {options.out}: {in_words(motion.clock)}")
 
 
 def _body(path: Path, options: Simulate, **more: Any) -> BodyMotion:
