@@ -54,8 +54,8 @@ class Simulate:
     frames: int | None = None
     """Simulate only the first so many frames."""
     out_fps: float | Literal["body", "network"] = "body"
-    """Frames per second of the result: those of the body, so that it lies in the shot frame by frame, a number, or those
-    of the network, which is asked for its own (30 a second) in any case. The first frame is at the body's first."""
+    """Frames per second of the result: a number, those of the body, so that the garment lies in the shot frame by
+    frame, or those of the network (30), which are simulated in any case. It begins and ends with the body."""
 
 
 def run(options: Simulate) -> None:
@@ -79,9 +79,7 @@ def run(options: Simulate) -> None:
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
     rate = None if options.out_fps == "network" else options.out_fps
     shown = sys.stderr.isatty()
-    motion = simulator.rollout(
-        garment, body, first_vertices=first, frames=options.frames, out_fps=rate, progress=shown
-    )
+    motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, out_fps=rate, progress=shown)
     with spoken(fps="--out-fps"):
         motion.save(options.out)
     name = garment.name or "garment"

@@ -102,8 +102,9 @@ def _spread(path: Path, numbers: list[int], frames: np.ndarray) -> tuple[int, np
 
 
 def write_folder(path: Path, data: MotionData) -> None:
-    """Writes frame_1001.obj, frame_1002.obj, ... from the number of the first frame; a folder that holds nothing else is
-    replaced.
+    """Writes frame_1001.obj, frame_1002.obj, ... from the number of the first frame on.
+
+    A folder that holds nothing else is replaced.
 
     Warns:
         UserWarning: The first frame lies between two numbers, or before 0.

@@ -166,6 +166,12 @@ class BodyMotion:
         clock, places = self.clock.resampled(fps, frames, points=self.vertices.shape[1])
         return self._derived(between(self.vertices, places), self.faces, clock, self.degenerate_faces)
 
+    def on_clock(self, clock: Clock) -> BodyMotion:
+        """The motion at the frames of another clock, in a straight line between its own; before and after it stands
+        still."""
+        vertices = between(self.vertices, self.clock.places(clock.times))
+        return self._derived(vertices, self.faces, clock, self.degenerate_faces)
+
     def submesh(self, face_mask: Any) -> BodyMotion:
         """The motion of some faces only, without the vertices that belong to none of them.
 

@@ -138,4 +138,5 @@ def in_words(clock: Clock) -> str:
     """A clock for people: "25 frames, 1001 to 1025 at 24 a second (41.708 to 42.708 s)"."""
     first, count = clock.number, clock.frames
     numbers = f"{first:.8g} to {first + count - 1:.8g}" if count > 1 else f"{first:.8g}"
-    return f"{count:,} frame{'s' if count > 1 else ''}, {numbers} at {clock.fps:g} a second ({clock.start:.3f} to {clock.end:.3f} s)"
+    frames = f"{count:,} frame{'s' if count > 1 else ''}, {numbers} at {clock.fps:g} a second"
+    return f"{frames} ({clock.start:.3f} to {clock.end:.3f} s)"

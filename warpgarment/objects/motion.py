@@ -91,13 +91,21 @@ class GarmentMotion:
         if len(bad) and not np.isfinite(self.vertices[-1]).all():
             vertices, places = vertices[: bad[0] + 1], places[: bad[0] + 1]
             clock = clock if len(vertices) == clock.frames else Clock.checked(len(vertices), fps, self.start)
-        status = [self._status_at(place, frame) for frame, place in enumerate(places)] if self.status else []
-        return GarmentMotion(vertices, self.faces, fps, status, self.name, start=clock.start, last=clock.last)
+        return self._on(clock, vertices, places)
 
-    def _status_at(self, place: float, frame: int) -> RolloutStatus:
-        near = (self.status[int(np.floor(place))], self.status[int(np.ceil(place))])
-        worse = max(near, key=lambda status: (not status.finite, status.max_penetration))
-        return replace(worse, frame=frame)
+    def on_clock(self, clock: Clock) -> GarmentMotion:
+        """The motion at the frames of another clock, in a straight line between its own; before and after it stands
+        still. Between two frames the status is the worse of theirs."""
+        places = self.clock.places(clock.times)
+        return self._on(clock, between(self.vertices, places), places)
+
+    def _on(self, clock: Clock, vertices: np.ndarray, places: np.ndarray) -> GarmentMotion:
+        status = []
+        for frame, place in enumerate(places if self.status else ()):
+            near = (self.status[int(np.floor(place))], self.status[int(np.ceil(place))])
+            worse = max(near, key=lambda status: (not status.finite, status.max_penetration))
+            status.append(replace(worse, frame=frame))
+        return GarmentMotion(vertices, self.faces, clock.fps, status, self.name, start=clock.start, last=clock.last)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes the motion, completely or not at all.
@@ -105,11 +113,11 @@ class GarmentMotion:
         - ``.npz``: positions, faces, rate, start [s], status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres; time
           codes are frames, and the first one is `start` x `fps`: 1001 for a shot that starts there;
-        - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it; its header
-          says at which frame it starts;
-        - no suffix, or a slash at the end: a folder ``frame_1001.obj``, ``frame_1002.obj``, ..., numbered from the first
-          frame (from the nearest whole one, with a warning, where it lies between two); an existing folder is replaced
-          if it holds nothing else.
+        - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it; the
+          header says at which frame it starts;
+        - no suffix, or a slash at the end: a folder ``frame_1001.obj``, ``frame_1002.obj``, ..., the first number being
+          `start` x `fps` (with a warning where that is not whole); an existing folder is replaced if it holds nothing
+          else.
 
         Args:
             path: File or folder to write; parent folders are made.

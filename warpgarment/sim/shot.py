@@ -11,6 +11,7 @@ import torch
 from warpgarment.errors import MeshError, UsageError
 from warpgarment.geometry.checks import checked_fps
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 
 from .recording import read
@@ -47,6 +48,30 @@ def frames_needed(frames: int | None, out: float, network: float) -> int | None:
     return int(min(np.ceil((frames - 1) * network / out - 1e-6) + 1, 2.0**62))
 
 
+def bodies_of_shot(
+    bodies: Sequence[BodyMotion],
+    rates: Sequence[float],
+    frames: int | None,
+    garments: Sequence[Garment],
+    on: Sequence[int],
+) -> list[BodyMotion]:
+    """The bodies at the rates of the results, made before the simulation so that a rate that is none is found there.
+
+    Args:
+        bodies: The bodies as they were given.
+        rates: Frames per second of the results on each.
+        frames: No more than so many frames; None: all.
+        garments: The garments.
+        on: Which body each is on.
+
+    Raises:
+        MeshError: Frames of so high a rate would fill memory.
+    """
+    for garment, b in zip(garments, on, strict=True):
+        bodies[b].clock.resampled(rates[b], frames, points=len(garment.vertices))
+    return [body.resampled(rate, frames) for body, rate in zip(bodies, rates, strict=True)]
+
+
 @torch.inference_mode()
 def brought_to_shot(
     scene: Scene,
@@ -66,12 +91,11 @@ def brought_to_shot(
         scene: The scene of the rollout.
         motions: Its results, at the network's rate.
         on: Which body each garment is on.
-        bodies: The bodies as they were given.
+        bodies: The bodies at the rates of the results, see `bodies_of_shot`.
         seen: The bodies at the network's rate.
         rates: Frames per second of the results on each body.
         frames: No more than so many frames; None: all.
     """
-    bodies = [body.resampled(rate, frames) for body, rate in zip(bodies, rates, strict=True)]
     found = [motion.resampled(rates[b], frames) for motion, b in zip(motions, on, strict=True)]
     where = [now.clock.places(body.clock.times) for now, body in zip(seen, bodies, strict=True)]
     for frame in range(max(motion.frames for motion in found)):

@@ -35,7 +35,7 @@ from .graph import GraphedFrames
 from .history import History
 from .recording import READ_EVERY, Recording
 from .scene import Scene
-from .shot import Rate, brought_to_shot, frames_needed, rates_of
+from .shot import Rate, bodies_of_shot, brought_to_shot, frames_needed, rates_of
 from .state import SimulationState, Status, Vertices
 from .timing import Timings
 
@@ -143,8 +143,9 @@ class Simulator:
         """Simulates garments over motions of their bodies, as one batch.
 
         Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
-        network's rate. Results start when their body starts, and last as long. Garments whose motion is shorter stop earlier; one that stops being finite ends with that frame,
-        which holds NaN, with a status that says so and a RuntimeWarning.
+        network's rate. Results start when their body starts, and last as long. Garments whose motion is shorter stop
+        earlier; one that stops being finite ends with that frame, which holds NaN, with a status that says so and a
+        RuntimeWarning.
 
         Args:
             garment: One or a list.
@@ -181,6 +182,7 @@ class Simulator:
         known = self._known(garments, single, first_vertices, history)
         given = known.shape[0]
         on = [number[id(b)] for b in bodies]
+        shot = bodies_of_shot(unique, rates, frames, garments, on) if any(rate != fps for rate in rates) else None
         lengths = [min(motions[i].frames, needed[i] or 2**62) for i in on]
         if min(lengths) < given:
             raise ValueError(f"history has {given} frames, the shortest motion (or frames=) {min(lengths)}")
@@ -213,8 +215,8 @@ class Simulator:
             last = clock.last if len(moved) == clock.frames else None
             result = GarmentMotion(moved, worn.faces, fps, statuses, worn.name, start=clock.start, last=last)
             results.append(result)
-        if any(rate != fps for rate in rates):
-            results = brought_to_shot(states[0].scene, results, on, unique, motions, rates, frames)
+        if shot is not None:
+            results = brought_to_shot(states[0].scene, results, on, shot, motions, rates, frames)
         return results[0] if single else results
 
     @overload
