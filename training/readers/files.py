@@ -44,7 +44,7 @@ def recording(
     """A recording of animations of garments and of the body under them.
 
     Files that say at which frame they start are put together by that: the frames that all have are kept. Those that do
-    not say start with the others.
+    not say start with the others; so do those that say 0 and have as many frames.
 
     Args:
         garment: File or folder that `BodyMotion.load` reads, or several, innermost first; (file, mesh) names one mesh
@@ -181,6 +181,8 @@ def _rate(fps: float | None, rates: dict[str, float]) -> float:
 def _in_common(starts: Sequence[float | None], lengths: Sequence[int], names: Sequence[str]) -> list[slice]:
     """The frames of each file that all have; everything where the files do not differ in when they start.
 
+    A start of 0 counts as not said where all have as many frames, since programs write it when they do not know.
+
     Args:
         starts: Number of each file's first frame, None where it does not say.
         lengths: Numbers of frames.
@@ -190,6 +192,16 @@ def _in_common(starts: Sequence[float | None], lengths: Sequence[int], names: Se
     begins = [min(known, default=0.0) if start is None else start for start in starts]
     if not known or max(known) - min(known) < 1e-3:
         return [slice(None)] * len(starts)
+    if len(set(lengths)) == 1 and min(map(abs, known)) < 1e-3:
+        others = [start for start in known if abs(start) >= 1e-3]
+        if max(others) - min(others) < 1e-3:
+            warnings.warn(
+                f"some files start at frame {others[0]:g}, some at 0, with {lengths[0]:,} frames all of them: they are "
+                "put together from their first frames on.",
+                UserWarning,
+                stacklevel=3,
+            )
+            return [slice(None)] * len(starts)
     first, stop = max(begins), min(b + n for b, n in zip(begins, lengths, strict=True))
     listed = ", ".join(f"{name} {b:g} to {b + n - 1:g}" for name, b, n in zip(names, begins, lengths, strict=False))
     if any(abs(first - b - round(first - b)) > 1e-3 for b in begins):

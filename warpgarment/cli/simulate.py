@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any, Literal
 
 import tyro
 
+from warpgarment.errors import UsageError
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.clock import in_words
@@ -61,6 +63,8 @@ class Simulate:
 def run(options: Simulate) -> None:
     """Loads, fits if asked, rolls out, writes, and says how it went."""
     check_output(options.out, suffixes("write_motion"))
+    if isinstance(options.out_fps, float) and not 0 < options.out_fps < math.inf:
+        raise UsageError(f"--out-fps {options.out_fps:g}: a positive number of frames a second, body or network.")
     from warpgarment.sim.simulator import Simulator
 
     with spoken(mesh="--garment-mesh", unit="--unit", up="--up", clean="--clean"):
@@ -78,9 +82,9 @@ def run(options: Simulate) -> None:
         rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
     rate = None if options.out_fps == "network" else options.out_fps
-    shown = sys.stderr.isatty()
-    motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, out_fps=rate, progress=shown)
-    with spoken(fps="--out-fps"):
+    known = {"first_vertices": first, "frames": options.frames, "out_fps": rate}
+    with spoken(fps="--body-fps or --out-fps"):
+        motion = simulator.rollout(garment, body, **known, progress=sys.stderr.isatty())
         motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))

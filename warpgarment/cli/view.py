@@ -98,7 +98,10 @@ def _together(
     """The motions at the first garment's frames that all have; says so where that leaves some out."""
     paths = [*options.motion, *([options.body] if options.body is not None else [])]
     motions: list[Motion] = [*garments, *([body] if body is not None else [])]
-    shown: list[Any] = list(matched(motions, [str(path) for path in paths]))
+    try:
+        shown: list[Any] = list(matched(motions, [str(path) for path in paths]))
+    except UsageError as error:
+        raise UsageError(f"{error} Are --fps, --start, --body-fps and --body-start right?") from None
     if shown[0].frames < garments[0].frames:
         print(f"shown is what all have: {in_words(shown[0].clock)}, of {in_words(garments[0].clock)}")
     return (shown.pop() if body is not None else None), shown

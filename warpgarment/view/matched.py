@@ -49,7 +49,7 @@ def matched(motions: Sequence[Motion], names: Sequence[str], *, by: int = 0) -> 
     shown = np.flatnonzero((clock.times >= first - slack) & (clock.times <= last + slack))
     if not len(shown):
         listed = "; ".join(f"{name} has {in_words(one)}" for name, one in zip(names, clocks, strict=True))
-        raise UsageError(f"no frame in common: {listed}. Are the rates and the starts right?")
+        raise UsageError(f"no frame in common: {listed}.")
     part = slice(int(shown[0]), int(shown[-1]) + 1)
     times = clock.times[part]
     held = clock.last - part.start if part.stop == clock.frames else None
