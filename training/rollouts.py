@@ -57,6 +57,23 @@ class RecordedOnBody(Recorded, Protocol):
         """The collider."""
 
 
+def check_rate(recorded: float, network: float) -> None:
+    """Refuses recordings whose frames are at other moments than those that a network predicts.
+
+    Args:
+        recorded: Frames per second of the recording.
+        network: Those of the network.
+
+    Raises:
+        MeshError: They differ.
+    """
+    if abs(recorded - network) > 1e-6 * network:
+        raise MeshError(
+            f"the recording runs at {recorded:g} frames a second and the network at {network:g}: bring it to that rate "
+            "with Recording.resampled before it is written as a sequence."
+        )
+
+
 def predict(
     simulator: Simulator,
     sequence: Recorded,
@@ -93,12 +110,7 @@ def predict(
         known = np.array(sequence.vertices[first : newest + 1], np.float32)
     else:
         raise ValueError(f"a warm start needs {history} recorded frames; up to frame {newest} there are {newest + 1}")
-    rate = simulator.network.config.fps
-    if abs(body.fps - rate) > 1e-6 * rate:
-        raise MeshError(
-            f"the recording runs at {body.fps:g} frames a second and the network at {rate:g}: bring it to that rate "
-            "(Recording.resampled), or its frames are compared with those of other moments."
-        )
+    check_rate(body.fps, simulator.network.config.fps)
     part = BodyMotion(body.vertices[first : newest + steps + 1], body.faces, body.fps)
     with warnings.catch_warnings():  # a rollout that fails is visible in the figures
         warnings.simplefilter("ignore", RuntimeWarning)

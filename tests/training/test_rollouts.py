@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.scenes import network, simulator, skirt, walk
 from warpgarment.errors import MeshError
-from warpgarment.training.rollouts import predict
+from warpgarment.training.rollouts import check_rate, predict
 
 
 def test_recordings_at_another_rate_than_the_network_are_refused():
@@ -20,5 +20,6 @@ def test_recordings_at_another_rate_than_the_network_are_refused():
         recorded = SimpleNamespace(garment=garment, vertices=np.stack([garment.vertices] * 6), body=lambda m=motion: m)
         with pytest.raises(MeshError, match=f"the recording runs at {fps:g} frames a second and the network at 30"):
             predict(simulator(network()), recorded, 0, 3, cold=True)
+    check_rate(30.0, 30.0)
     recorded.body = lambda: walk(6)
     assert predict(simulator(network()), recorded, 0, 3, cold=True).shape == (3, len(garment.vertices), 3)

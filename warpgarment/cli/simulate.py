@@ -82,7 +82,7 @@ def run(options: Simulate) -> None:
         rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
     rate = None if options.out_fps == "network" else options.out_fps
-    known = {"first_vertices": first, "frames": options.frames, "out_fps": rate}
+    known: dict[str, Any] = {"first_vertices": first, "frames": options.frames, "out_fps": rate}
     with spoken(fps="--body-fps or --out-fps"):
         motion = simulator.rollout(garment, body, **known, progress=sys.stderr.isatty())
         motion.save(options.out)
