@@ -130,6 +130,9 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     _check_name(path, arrays, options.mesh)
     fps = _rate(path, arrays)
     seconds, start, last = (_number(path, key, arrays[key]) if key in arrays else None for key in TIMES)
+    for key, value in zip(TIMES, (seconds, start, last), strict=True):
+        if value is not None and not math.isfinite(value):
+            raise MeshError(f"{path}: {key} must be finite, not {value}.")
     extra = {key: array for key, array in arrays.items() if key not in known and not _is_rate(key)}
     whole = MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
     return whole._replace(start=start, seconds=seconds, last=last)
