@@ -22,7 +22,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
-from warpgarment.training.rollouts import predict, rigid, skinned
+from warpgarment.training.rollouts import check_rate, predict, rigid, skinned
 from warpgarment.training.train.training_set import reason_of
 
 METHODS = ("network", "skinned", "rigid")
@@ -89,6 +89,7 @@ def measure(
         try:
             sequence = Sequence.load(folder)
             body = sequence.body()
+            check_rate(body.fps, simulator.network.config.fps)
             last = min(len(sequence.vertices), body.frames) - 1
             if last < history:
                 raise ValueError(f"{last + 1} frames, fewer than history + 1 = {history + 1}")

@@ -74,7 +74,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     skipped: dict[str, str] = {}
     try:
         sequences = load_sequences(config, network.config, skipped, group)
-        validation = load_validation(config, skipped) if group.first else []
+        validation = load_validation(config, skipped, network.config.fps) if group.first else []
         builder = SampleBuilder(sequences, network.config, config.noise, config.augmentation)
         sizes, counts = [len(s.faces) for s in sequences], [s.count - config.unroll.steps + 1 for s in sequences]
         plan = Plan(sizes, counts, config.batch_size, config.seed)

@@ -15,6 +15,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.objects.body import BodyMotion
 from warpgarment.training.data.sequence import Sequence, list_sequences, read_manifest
 from warpgarment.training.distributed import Group
+from warpgarment.training.rollouts import check_rate
 from warpgarment.training.samples.interactions import cached, default_cache
 from warpgarment.training.samples.recorded import SequenceData
 
@@ -48,7 +49,9 @@ def load_sequences(
     sequences = []
     for folder in _watched(folders, group):
         try:
-            sequences.append(SequenceData(Sequence.load(folder), folder, cache, network, group.device))
+            sequence = Sequence.load(folder)
+            check_rate(sequence.fps, network.fps)
+            sequences.append(SequenceData(sequence, folder, cache, network, group.device))
         except Exception as error:
             skipped[folder.name] = reason_of(error)
     names = "\n".join(f"{s.name} {len(s.faces)} {s.count}" for s in sequences)
@@ -60,8 +63,13 @@ def load_sequences(
     return sequences
 
 
-def load_validation(config: TrainConfig, skipped: dict[str, str]) -> list[tuple[Sequence, BodyMotion, int]]:
-    """A few validation sequences, evenly spread over the list: (sequence, body, number of frames to predict)."""
+def load_validation(
+    config: TrainConfig, skipped: dict[str, str], fps: float = 30.0
+) -> list[tuple[Sequence, BodyMotion, int]]:
+    """A few validation sequences, evenly spread over the list: (sequence, body, number of frames to predict).
+
+    Sequences whose frames per second are not `fps`, those of the network, are skipped.
+    """
     folders = folders_of(Path(config.data), "validation", skipped)
     wanted = min(config.validate_sequences, len(folders))
     chosen = [folders[(i * len(folders)) // wanted] for i in range(wanted)]
@@ -70,6 +78,7 @@ def load_validation(config: TrainConfig, skipped: dict[str, str]) -> list[tuple[
         try:
             sequence = Sequence.load(folder)
             body = sequence.body()
+            check_rate(body.fps, fps)
             frames = min(len(sequence.vertices), body.frames, config.validate_frames + 1)
             if frames < 2 or not np.isfinite(np.asarray(sequence.vertices[:frames])).all():
                 raise ValueError("too short, or not finite")

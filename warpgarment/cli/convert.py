@@ -10,6 +10,7 @@ import tyro
 
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.clock import in_words
 
 from . import spoken
 from .outputs import Output, check_output
@@ -24,7 +25,7 @@ class Convert:
     output: tyro.conf.Positional[Output]
     """Motion to write: .npz, .usd (.usda, .usdc), .pc2, or a folder of .obj."""
     fps: float | None = None
-    """Resample to this rate; by default the rate stays."""
+    """Resample to this rate; by default the rate stays. The motion begins and ends when it did."""
     input_fps: float | None = None
     """Rate of the input, where its file does not say (.pc2, folders of .obj) or says something else."""
     unit: str | None = None
@@ -49,5 +50,6 @@ def run(options: Convert) -> None:
         )
     if options.fps is not None:
         motion = motion.resampled(options.fps)
-    motion.save(options.output)
-    print(f"{options.output}: {motion.frames} frames at {motion.fps:g} fps, {motion.vertices.shape[1]} vertices")
+    with spoken(fps="--fps"):
+        motion.save(options.output)
+    print(f"{options.output}: {in_words(motion.clock)}, {motion.vertices.shape[1]} vertices")

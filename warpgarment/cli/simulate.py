@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +10,10 @@ from typing import Any, Literal
 
 import tyro
 
+from warpgarment.errors import UsageError
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.clock import in_words
 from warpgarment.objects.garment import Garment
 from warpgarment.view.report import rollout_table
 
@@ -52,11 +55,16 @@ class Simulate:
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
     frames: int | None = None
     """Simulate only the first so many frames."""
+    out_fps: float | Literal["body", "network"] = "body"
+    """Frames per second of the result: a number, those of the body, so that the garment lies in the shot frame by
+    frame, or those of the network (30), which are simulated in any case. It begins and ends with the body."""
 
 
 def run(options: Simulate) -> None:
     """Loads, fits if asked, rolls out, writes, and says how it went."""
     check_output(options.out, suffixes("write_motion"))
+    if isinstance(options.out_fps, float) and not 0 < options.out_fps < math.inf:
+        raise UsageError(f"--out-fps {options.out_fps:g}: a positive number of frames a second, body or network.")
     from warpgarment.sim.simulator import Simulator
 
     with spoken(mesh="--garment-mesh", unit="--unit", up="--up", clean="--clean"):
@@ -73,11 +81,14 @@ def run(options: Simulate) -> None:
         whole = _body(options.body, options, collider=False)
         rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
-    motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, progress=sys.stderr.isatty())
-    motion.save(options.out)
+    rate = None if options.out_fps == "network" else options.out_fps
+    known: dict[str, Any] = {"first_vertices": first, "frames": options.frames, "out_fps": rate}
+    with spoken(fps="--body-fps or --out-fps"):
+        motion = simulator.rollout(garment, body, **known, progress=sys.stderr.isatty())
+        motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))
-    print(f"\nwrote {options.out}")
+    print(f"\nwrote {options.out}: {in_words(motion.clock)}")
 
 
 def _body(path: Path, options: Simulate, **more: Any) -> BodyMotion:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,7 +40,9 @@ class MotionData(NamedTuple):
         name: Of the mesh inside the file; empty where it has none.
         extra: Further arrays by name, in formats that keep them.
         step: How many frames of the rate lie between two of these, as the file says; `fps` is for one of them.
-        start: Number of the first frame, in steps.
+        start: Number of the first frame, in steps, counted from time 0; None where the file does not say.
+        seconds: Time of the first frame [s], where the file says that in place of a number, or besides.
+        last: When the last frame is reached, in frames after the first, where that is not T - 1.
     """
 
     vertices: np.ndarray
@@ -50,7 +52,15 @@ class MotionData(NamedTuple):
     name: str = ""
     extra: Mapping[str, np.ndarray] = {}
     step: float = 1.0
-    start: float = 0.0
+    start: float | None = None
+    seconds: float | None = None
+    last: float | None = None
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, faces: np.ndarray, clock: Any, **more: Any) -> MotionData:
+        """A motion with frames at the times of an `objects.clock.Clock`."""
+        held = clock.last if clock.last != clock.frames - 1 else None
+        return cls(vertices, faces, clock.fps, start=clock.number, seconds=clock.start, last=held, **more)
 
 
 class ReadOptions(NamedTuple):

@@ -142,6 +142,16 @@ def rate_of(path: Path, data: MotionData, fps: float | None) -> float:
     return rate / data.step
 
 
+def start_of(data: MotionData, fps: float) -> float:
+    """Time of the first frame [s]: what the file says in seconds, else the number of the frame, at this rate; else 0.
+
+    Args:
+        data: What was read.
+        fps: Frames per second, as `rate_of` has them.
+    """
+    return data.seconds if data.seconds is not None else (data.start or 0.0) / fps
+
+
 def write_mesh(path: Path, data: MeshData) -> None:
     """Writes a mesh by suffix, completely or not at all.
 

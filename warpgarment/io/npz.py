@@ -23,6 +23,7 @@ from .parts import ALL, Parts, named
 MAGIC = b"\x93NUMPY"
 LARGE, RATIO = 64 << 20, 100  # bytes of an array from which on it is asked how much smaller it is in the file
 RATE = re.compile(r".*fps|.*framerate|framespersecond|sampl(e|ing)rate")  # letters of the names that rates have
+TIMES = ("start", "start_frame", "last")  # of the first frame [s], or its number; see `MotionData.last`
 SKINNED = ("rest_vertices", "faces", "bone_indices", "bone_weights", "bone_transforms")
 
 
@@ -109,7 +110,7 @@ def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     """Positions, or a rest mesh with bones that move it."""
-    known = {"vertices", "collider_faces", *SKINNED}
+    known = {"vertices", "collider_faces", *TIMES, *SKINNED}
     arrays = read_npz(
         path, ("faces",), lambda key: key in known or key == "name" or key.startswith("status_") or _is_rate(key)
     )
@@ -128,8 +129,13 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
             raise MeshError(f"{path}: {error}") from None
     _check_name(path, arrays, options.mesh)
     fps = _rate(path, arrays)
+    seconds, start, last = (_number(path, key, arrays[key]) if key in arrays else None for key in TIMES)
+    for key, value in zip(TIMES, (seconds, start, last), strict=True):
+        if value is not None and not math.isfinite(value):
+            raise MeshError(f"{path}: {key} must be finite, not {value}.")
     extra = {key: array for key, array in arrays.items() if key not in known and not _is_rate(key)}
-    return MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
+    whole = MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
+    return whole._replace(start=start, seconds=seconds, last=last)
 
 
 def _is_rate(key: str) -> bool:
@@ -140,14 +146,18 @@ def _rate(path: Path, arrays: Mapping[str, np.ndarray]) -> float | None:
     """Frames per second under one of the names that people use; None where there is none."""
     found: dict[str, float] = {}
     for key in filter(_is_rate, arrays):
-        try:
-            found[key] = float(arrays[key].reshape(()))
-        except (TypeError, ValueError):
-            raise MeshError(f"{path}: {key} must be a single number.") from None
+        found[key] = _number(path, key, arrays[key])
     if len(set(found.values())) > 1:
         listed = ", ".join(f"{key} {rate:g}" for key, rate in found.items())
         raise MeshError(f"{path}: rates that differ: {listed}. Keep one of them.")
     return next(iter(found.values()), None)
+
+
+def _number(path: Path, key: str, array: np.ndarray) -> float:
+    try:
+        return float(array.reshape(()))
+    except (TypeError, ValueError):
+        raise MeshError(f"{path}: {key} must be a single number.") from None
 
 
 def _check_name(path: Path, arrays: Mapping[str, np.ndarray], mesh: str | None) -> None:
@@ -165,8 +175,9 @@ def _write_mesh(path: Path, data: MeshData) -> None:
 
 
 def _write_motion(path: Path, data: MotionData) -> None:
-    rate = {} if data.fps is None else {"fps": np.array(data.fps, dtype=np.float64)}
-    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **rate, **data.extra})
+    times = {"fps": data.fps, "start": data.seconds, "last": data.last}
+    told = {key: np.array(value, dtype=np.float64) for key, value in times.items() if value is not None}
+    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **told, **data.extra})
 
 
 FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True)

@@ -130,7 +130,7 @@ def _write(path: Path, data: MotionData) -> None:
     """The cache, and its first frame as .obj of the same name beside it."""
     with atomic_files(path.with_suffix(".obj"), path) as (mesh, cache):
         mesh.write_text(obj_text(data.vertices[0], data.faces, data.name), encoding="utf-8")
-        write_pc2_to(cache, data.vertices)
+        write_pc2_to(cache, data.vertices, start=data.start or 0.0)
 
 
 FORMAT = Format(read_motion=_read, write_motion=_write, named=True)

@@ -35,6 +35,7 @@ from .graph import GraphedFrames
 from .history import History
 from .recording import READ_EVERY, Recording
 from .scene import Scene
+from .shot import Rate, bodies_of_shot, brought_to_shot, frames_needed, rates_of
 from .state import SimulationState, Status, Vertices
 from .timing import Timings
 
@@ -110,6 +111,7 @@ class Simulator:
         first_vertices: Any = None,
         history: Any = None,
         frames: int | None = None,
+        out_fps: Rate = None,
         face_splits: int = 1,
         progress: bool = False,
     ) -> GarmentMotion: ...
@@ -123,6 +125,7 @@ class Simulator:
         first_vertices: Any = None,
         history: Any = None,
         frames: int | None = None,
+        out_fps: Rate = None,
         face_splits: int = 1,
         progress: bool = False,
     ) -> list[GarmentMotion]: ...
@@ -135,14 +138,16 @@ class Simulator:
         first_vertices: Any = None,
         history: Any = None,
         frames: int | None = None,
+        out_fps: Rate = None,
         face_splits: int = 1,
         progress: bool = False,
     ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
         Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
-        network's rate. Garments whose motion is shorter stop earlier; one that stops being finite ends with that frame,
-        which holds NaN, with a status that says so and a RuntimeWarning.
+        network's rate. Results start when their body starts, and last as long. Garments whose motion is shorter stop
+        earlier; one that stops being finite ends with that frame, which holds NaN, with a status that says so and a
+        RuntimeWarning.
 
         Args:
             garment: One garment, or a list.
@@ -151,13 +156,16 @@ class Simulator:
                 positions `garment.vertices`: see `wg.fit`.
             history: Known first frames, shape [H,V,3] (or a list) with H the network's `history`, of the body's first H
                 frames. They are returned as they are, and the simulation goes on from them.
-            frames: Largest number of frames, known ones included; None for the whole motion.
+            frames: Largest number of frames of the result, known ones included; None for the whole motion.
+            out_fps: Frames per second of the result: None for the network's; "body" for those of each body, frame by
+                frame; or a number. Between the network's frames positions are interpolated in time, moved out of the
+                body at that time, and measured.
             face_splits: Number of interleaved subsets of the faces that the network sees one at a time. More subsets
                 take less time and memory.
             progress: Whether to show a progress bar.
 
         Returns:
-            A `GarmentMotion` at the network's rate, or a list of them for a list of garments.
+            A `GarmentMotion`, or a list of them for a list of garments.
 
         Raises:
             ValueError: Lists have different lengths, arrays have other shapes, or both `first_vertices` and `history`
@@ -172,10 +180,15 @@ class Simulator:
         number = {id(b): i for i, b in enumerate(unique)}
         if frames is not None and frames < 1:
             raise UsageError(f"frames must be at least 1, got {frames}")
-        motions = [b.resampled(self.network.config.fps, frames) for b in unique]
+        fps = self.network.config.fps
+        rates = rates_of(unique, out_fps, fps)
+        needed = [frames_needed(frames, rate, fps) for rate in rates]
+        motions = [b.resampled(fps, count) for b, count in zip(unique, needed, strict=True)]
         known = self._known(garments, single, first_vertices, history)
         given = known.shape[0]
-        lengths = [min(motions[number[id(b)]].frames, frames or 2**62) for b in bodies]
+        on = [number[id(b)] for b in bodies]
+        shot = bodies_of_shot(unique, rates, frames, garments, on) if any(rate != fps for rate in rates) else None
+        lengths = [min(motions[i].frames, needed[i] or 2**62) for i in on]
         if min(lengths) < given:
             raise ValueError(f"history has {given} frames, the shortest motion (or frames=) {min(lengths)}")
 
@@ -185,7 +198,7 @@ class Simulator:
         packed = PackedBodies.pack(
             [m.faces for m in motions],
             [m.vertices.shape[1] for m in motions],
-            [number[id(b)] for b in bodies],
+            on,
             self.device,
         )
         first = [body_at(frame) for frame in range(given)]
@@ -203,7 +216,12 @@ class Simulator:
                 label = worn.name or f"garment {i}"
                 warnings.warn(f"{label} stopped: {statuses[-1].message}", RuntimeWarning, stacklevel=2)
             moved = recording.positions[i][: len(statuses)]
-            results.append(GarmentMotion(moved, worn.faces, self.network.config.fps, statuses, worn.name))
+            clock = motions[on[i]].clock
+            last = clock.last if len(moved) == clock.frames else None
+            result = GarmentMotion(moved, worn.faces, fps, statuses, worn.name, start=clock.start, last=last)
+            results.append(result)
+        if shot is not None:
+            results = brought_to_shot(states[0].scene, results, on, shot, motions, rates, frames)
         return results[0] if single else results
 
     @overload

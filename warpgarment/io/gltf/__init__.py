@@ -72,8 +72,8 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
                 f'mesh="{ALL}".'
             )
     name = placed[0].name if len(placed) == 1 else ""
-    start = float(codes[0]) * frames.fps if frames.fps else 0.0
-    return MotionData(vertices, faces, frames.fps, name=name, start=start), name
+    seconds = float(codes[0]) if len(frames.codes) else None
+    return MotionData(vertices, faces, frames.fps, name=name, seconds=seconds), name
 
 
 def _still(document: Document) -> Document:

@@ -23,11 +23,14 @@ def _write_mesh(path: Path, data: MeshData) -> None:
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     found = read_usd(path, mesh=options.mesh, convert=options.unit is None, turn=options.up is None)
+    if found.fps is None:
+        return MotionData(found.vertices, found.faces, name=found.name, seconds=found.start)
     return MotionData(found.vertices, found.faces, found.fps, name=found.name, start=found.start)
 
 
 def _write_motion(path: Path, data: MotionData) -> None:
-    write_usd(path, [(data.name or "mesh", data.vertices, data.faces)], 30.0 if data.fps is None else data.fps)
+    fps, start = 30.0 if data.fps is None else data.fps, data.start or 0.0
+    write_usd(path, [(data.name or "mesh", data.vertices, data.faces)], fps, start=start)
 
 
 FORMAT = Format(

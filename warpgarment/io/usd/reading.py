@@ -24,7 +24,7 @@ class UsdMesh(NamedTuple):
     vertices: np.ndarray  # float32 [T,V,3]
     faces: np.ndarray  # int64 [F,3]
     fps: float | None  # None for a single frame
-    start: float = 0.0  # time of the first frame in frames: its time code, where the stage counts frames
+    start: float = 0.0  # time of the first frame in frames: its time code, where the stage counts frames; of one, [s]
 
 
 def read_usd(
@@ -87,7 +87,7 @@ def read_usd(
     if convert:
         vertices = vertices * UsdGeom.GetStageMetersPerUnit(stage)
     fps = chosen.fps
-    start = float(chosen.codes[0]) * fps / stage.GetTimeCodesPerSecond() if fps else 0.0
+    start = float(chosen.codes[0]) * (fps or 1.0) / stage.GetTimeCodesPerSecond() if len(chosen.codes) else 0.0
     with np.errstate(over="ignore"):
         return UsdMesh(prim.GetName(), vertices.astype(np.float32), faces, fps, start)
 
