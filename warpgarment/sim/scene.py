@@ -30,6 +30,7 @@ from warpgarment.sim.stages.reconstruct import Reconstruct
 
 from . import memory
 from .bodies import MovingBodies
+from .brought import Brought
 from .surface import Surface
 from .timing import Timings
 
@@ -52,6 +53,7 @@ class Scene:
         timings: Where the stages add up how long they took.
         contact_sources: What finds contacts, such as `BodyContacts()`.
         correctors: What changes positions after contact.
+        brought: What users brought, where it is more than `garments`.
 
     Attributes:
         contact_sources: A list, which may grow until the first frame; so is `correctors`.
@@ -77,6 +79,7 @@ class Scene:
         timings: Timings,
         contact_sources: Sequence[ContactSource] = (BodyContacts(),),
         correctors: Sequence[Corrector] = (),
+        brought: Brought | None = None,
     ) -> None:
         if network.reads:
             raise ValueError(f"the network reads {', '.join(sorted(network.reads))}, which simulations do not give yet")
@@ -92,6 +95,7 @@ class Scene:
             device=device,
             correctors=self.correctors,
         )
+        self.brought, self.topology = brought, bodies
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
         self.bodies = MovingBodies(body_vertices, bodies)
