@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from warpgarment.geometry.checks import (
     checked_fps,
     checked_positions,
     complain,
+    far_from_origin,
     no_area,
     repeated_vertices,
     to_numpy,
@@ -43,6 +45,9 @@ class BodyMotion:
     Raises:
         MeshError: The arrays have other shapes, no frames or no faces, numbers that are not finite (named by frame),
             indices out of range, no face with an area, or a rate that is not positive.
+
+    Warns:
+        UserWarning: Faces were turned round; or the body is so far from the origin that float32 cannot tell its shape.
     """
 
     def __init__(self, vertices: Any, faces: Any, fps: float = 30.0):
@@ -53,6 +58,9 @@ class BodyMotion:
         self.degenerate_faces = int(np.count_nonzero(flat))
         if flat.all():
             complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
+        far = far_from_origin(to_numpy(vertices)[0], self.faces, "the body")
+        if far:
+            warnings.warn(far, UserWarning, stacklevel=2)
         self.faces = turned_outward(self.vertices[0], self.faces, "the body")
 
     @classmethod

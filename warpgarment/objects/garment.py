@@ -19,6 +19,7 @@ from warpgarment.geometry.checks import (
     checked_pins,
     checked_positions,
     directed_edges,
+    far_from_origin,
     to_numpy,
 )
 from warpgarment.geometry.clean import clean_mesh
@@ -71,6 +72,7 @@ class Garment:
         self.vertices = checked_positions(vertices)
         self.faces = checked_faces(faces, len(self.vertices), remedy=REMEDY)
         self.faces = agreeing(self.vertices, self.faces, f"garment {name!r}" if name else "the garment")
+        _warn(far_from_origin(vertices, self.faces, f"garment {name!r}" if name else "the garment"))
         check_rest_mesh(self.vertices, self.faces)
         self.pins = checked_pins(pins, len(self.vertices))
         self.name = str(name)

@@ -1,4 +1,4 @@
-"""What users brought to a batch, and the way from what is simulated to their own vertices; see `objects/simulated.py`."""
+"""What users brought to a batch, and the way from what is simulated to their vertices; see `objects/simulated.py`."""
 
 from __future__ import annotations
 
