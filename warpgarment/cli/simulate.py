@@ -11,7 +11,9 @@ import tyro
 
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.facts import Facts
 from warpgarment.objects.garment import Garment
+from warpgarment.view.facts import facts_table
 from warpgarment.view.report import rollout_table
 
 from . import spoken
@@ -47,7 +49,8 @@ class Simulate:
     body_mesh: str | None = None
     """Name of the mesh where the body's file holds several."""
     clean: bool = False
-    """Repair the garment's mesh: join vertices at the same place, turn faces that disagree, drop broken ones."""
+    """Join seams (open borders whose vertices are at the same place, within 5 % of the edge length), turn faces that
+    disagree, drop broken ones. Written are all vertices of the file, in its order."""
     fit_rest: Path | None = None
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
     frames: int | None = None
@@ -55,7 +58,7 @@ class Simulate:
 
 
 def run(options: Simulate) -> None:
-    """Loads, fits if asked, rolls out, writes, and says how it went."""
+    """Loads, says what the files hold, fits if asked, rolls out, writes, and says how it went."""
     check_output(options.out, suffixes("write_motion"))
     from warpgarment.sim.simulator import Simulator
 
@@ -64,6 +67,7 @@ def run(options: Simulate) -> None:
             options.garment, unit=options.unit, up=options.up, mesh=options.garment_mesh, clean=options.clean
         )
     body = _body(options.body, options)
+    print(facts_table({"garment": Facts.of(garment), "body": Facts.of(body)}), end="\n\n", flush=True)
     simulator = Simulator.from_pretrained(options.weights, device=options.device)
     simulator.timings.synchronise = True
     first = None

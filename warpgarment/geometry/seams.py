@@ -2,7 +2,8 @@
 
 A vertex of an open border is joined with others that are as good as at its place,
 
-    |p_i - p_j| <= SHARE * mean edge length (edges of large faces count more, so that a button's do not set the scale),
+    |p_i - p_j| <= SHARE * min(L, l_i, l_j),    L: mean edge length (edges of large faces count more, so that a button's
+                                                do not set the scale),  l_i: of the border's edges at i
 
 where their borders meet in at least two places. Vertices inside a surface never are: layers that merely touch stay two.
 Nor is anything joined that would make a face collapse, double a face, or give an edge a third face.
@@ -20,7 +21,7 @@ from scipy.spatial import cKDTree
 from .checks import directed_edges, duplicate_faces, repeated_vertices
 
 SHARE = 0.05
-"""Distance within which borders coincide, as a share of the mean edge length."""
+"""Distance within which borders coincide, as a share of the length of edges."""
 
 REMEDY = "Garment.load(path, clean=True) or garment.cleaned() joins them."
 
@@ -31,7 +32,7 @@ class Seams(NamedTuple):
     group: np.ndarray
     """For each vertex the lowest one that it is to be joined with, int64 [V]; itself where there is none."""
     tolerance: float
-    """Distance within which vertices were taken for one [m]."""
+    """Distance within which vertices were taken for one [m]; less where edges are shorter than most."""
     apart: int
     """Vertices that were left apart, since an edge would have had a third face, or a face would have collapsed."""
 
@@ -49,7 +50,7 @@ class Seams(NamedTuple):
         """What was found, as the beginning of a sentence."""
         return (
             f"{self.sides:,} vertices on open borders lie at {self.places:,} places, within {1e3 * self.tolerance:.2g} "
-            f"mm of each other ({100 * SHARE:g} % of the mean edge length)"
+            f"mm of each other ({100 * SHARE:g} % of the mean edge length, or of the edges there if these are shorter)"
         )
 
 
@@ -96,6 +97,11 @@ def _pairs(vertices: np.ndarray, border: np.ndarray, edges: np.ndarray, toleranc
         return np.zeros((0, 2), np.int64)
     found = cKDTree(vertices[on_border]).query_pairs(tolerance, output_type="ndarray")
     pairs = np.sort(on_border[found.reshape(-1, 2)], axis=1)
+    length = np.linalg.norm(vertices[border[:, 0]] - vertices[border[:, 1]], axis=1)
+    uses = np.maximum(np.bincount(border.reshape(-1), minlength=len(vertices)), 1)
+    local = SHARE * np.bincount(border.reshape(-1), np.repeat(length, 2), len(vertices)) / uses
+    gap = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+    pairs = pairs[gap <= local[pairs].min(axis=1, initial=np.inf)]
     count = np.int64(len(vertices))
     pairs = pairs[~np.isin(pairs[:, 0] * count + pairs[:, 1], edges[:, 0] * count + edges[:, 1])]
     loops = np.sort(_connected(len(vertices), border)[pairs], axis=1)

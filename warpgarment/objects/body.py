@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from warpgarment.geometry.checks import (
 )
 from warpgarment.geometry.orientation import turned_outward
 
+if TYPE_CHECKING:
+    from warpgarment.io.source import Source
+
 MOST_BETWEEN, LARGEST = 100, 1 << 30  # new frames for each old one, and bytes, that resampling makes at most
 
 
@@ -36,6 +39,7 @@ class BodyMotion:
         vertices: Positions [m], Y up, float32, shape [T,V,3].
         faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
         fps: Frames per second.
+        source: How its file was read (`warpgarment.io.source.Source`); None for a motion made of arrays.
 
     Args:
         vertices: Positions [m], shape [T,V,3]; NumPy, torch or nested lists.
@@ -49,6 +53,8 @@ class BodyMotion:
     Warns:
         UserWarning: Faces were turned round; or the body is so far from the origin that float32 cannot tell its shape.
     """
+
+    source: Source | None = None
 
     def __init__(self, vertices: Any, faces: Any, fps: float = 30.0):
         self.vertices = checked_positions(vertices, frames=True)
@@ -121,13 +127,19 @@ class BodyMotion:
             FileNotFoundError: There is no such file.
         """
         from warpgarment.io.files import rate_of, read_motion
+        from warpgarment.io.source import source_of
 
         path = Path(path)
         data = read_motion(path, unit=unit, mesh=mesh, up=up)
         rate = rate_of(path, data, fps)
         try:
             motion = cls(data.vertices, data.faces, rate)
-            return motion.submesh(data.collider_faces) if collider and data.collider_faces is not None else motion
+            if collider and data.collider_faces is not None:
+                motion = motion.submesh(data.collider_faces)
+            motion.source = source_of(
+                path, unit=unit, mesh=mesh, up=up, fps=fps, file_fps=data.fps, frames=motion.frames
+            )
+            return motion
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
 

@@ -32,6 +32,7 @@ from .simulated import Simulated
 
 if TYPE_CHECKING:
     from warpgarment.geometry.pooled_geodesics import PooledGeodesics
+    from warpgarment.io.source import Source
 
 
 POOLED = 10_000  # with more faces the network's weights are pooled: F x F of them would take 400 MB
@@ -46,6 +47,7 @@ class Garment:
         faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
         pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty if there are none.
         name: Name of the garment, for messages and file names.
+        source: How its file was read (`warpgarment.io.source.Source`); None for a garment made of arrays.
 
     Borders of panels that lie at the same place stay open unless they are joined (`clean=True`, `cleaned`), and small
     loose pieces such as buttons ride on the cloth: see `simulated`.
@@ -66,6 +68,7 @@ class Garment:
             warning), or vertices without a face. The error names the element, the count and the remedy.
     """
 
+    source: Source | None = None
     _joined: tuple[Garment, np.ndarray] | None = None  # a mesh with its seams joined, and where each vertex went [V]
 
     def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = ""):
@@ -119,6 +122,7 @@ class Garment:
                 `clean` has changed; and as `simulated`.
         """
         from warpgarment.io.files import read_mesh
+        from warpgarment.io.source import source_of
 
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh, up=up)
@@ -130,6 +134,7 @@ class Garment:
                 else cls(data.vertices, data.faces, **told)
             )
             garment.simulated  # noqa: B018  # what is said of it is said where it is read
+            garment.source = source_of(path, unit=unit, mesh=mesh, up=up)
             return garment
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
