@@ -37,15 +37,12 @@ class Cleaned(NamedTuple):
         did = []
         if self.seams.sides:
             did.append(f"{self.seams.found()} and are joined")
-        if self.seams.apart:
-            did.append(
-                f"{self.seams.apart:,} more are left apart, since a face would collapse or an edge have more than two"
-            )
         if self.dropped:
             did.append(f"{self.dropped:,} of {len(self.faces) + self.dropped:,} faces are dropped")
         if self.turned:
             did.append(f"{self.turned:,} faces that disagreed with the others about the outside are turned round")
-        return f"{what}: {'; '.join(did)}." if did else ""
+        said = [f"{what}: {'; '.join(did)}."] if did else []
+        return " ".join([*said, self.seams.unjoined()]).strip()
 
 
 def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> Cleaned:

@@ -35,6 +35,8 @@ class Seams(NamedTuple):
     """Distance within which vertices were taken for one [m]; less where edges are shorter than most."""
     apart: int
     """Vertices that were left apart, since an edge would have had a third face, or a face would have collapsed."""
+    between: int
+    """Vertices that lie on an edge of another border and not at one of its ends, and so cannot be joined."""
 
     @property
     def sides(self) -> int:
@@ -45,6 +47,21 @@ class Seams(NamedTuple):
     def places(self) -> int:
         """Vertices that are left of these once they are joined."""
         return int(np.count_nonzero(np.bincount(self.group, minlength=1) > 1))
+
+    def unjoined(self) -> str:
+        """Sentences on what cannot be joined; empty where there is nothing."""
+        said = []
+        if self.apart:
+            said.append(
+                f"{self.apart:,} more are at the place of others and left apart: a face would collapse or an edge "
+                "have three."
+            )
+        if self.between:
+            said.append(
+                f"{self.between:,} vertices on open borders lie on edges of other borders, between their vertices: if "
+                "these are seams, they stay open there. Give both sides the same vertices."
+            )
+        return " ".join(said)
 
     def found(self) -> str:
         """What was found, as the beginning of a sentence."""
@@ -65,20 +82,41 @@ def coinciding_borders(vertices: np.ndarray, faces: np.ndarray) -> Seams:
     faces = faces[~repeated_vertices(faces)]
     group = np.arange(len(vertices))
     if len(faces) == 0:
-        return Seams(group, 0.0, 0)
+        return Seams(group, 0.0, 0, 0)
     tolerance = SHARE * _edge_length(vertices, faces)
     edges, count = np.unique(np.sort(directed_edges(faces), axis=1), axis=0, return_counts=True)
     border = edges[count == 1]
     pairs = _pairs(vertices, border, edges, tolerance)
-    if len(pairs) == 0:
-        return Seams(group, tolerance, 0)
     label = _connected(len(vertices), pairs)
     wanted = np.bincount(label)[label] > 1
     label = _manifold(vertices, faces, label)
     lowest = np.unique(label, return_index=True)
     group = lowest[1][np.searchsorted(lowest[0], label)]
     joined = np.bincount(group, minlength=len(group))[group] > 1
-    return Seams(group, tolerance, int(np.count_nonzero(wanted & ~joined)))
+    apart, between = wanted & ~joined, _between(vertices, border, label, tolerance)
+    return Seams(group, tolerance, int(np.count_nonzero(apart)), int(np.count_nonzero(between & ~wanted)))
+
+
+def _between(vertices: np.ndarray, border: np.ndarray, label: np.ndarray, tolerance: float) -> np.ndarray:
+    """Border vertices that lie on a border edge away from both its ends, bool [V]."""
+    result = np.zeros(len(vertices), dtype=bool)
+    if len(border) == 0:
+        return result
+    on_border = np.unique(border)
+    start, along = vertices[border[:, 0]], vertices[border[:, 1]] - vertices[border[:, 0]]
+    length = np.linalg.norm(along, axis=1)
+    near = cKDTree(vertices[on_border]).query_ball_point(start + 0.5 * along, 0.5 * length + tolerance)
+    edge = np.repeat(np.arange(len(border)), [len(found) for found in near])
+    vertex = on_border[np.concatenate([*near, []]).astype(np.int64)]
+    other = (label[vertex] != label[border[edge, 0]]) & (label[vertex] != label[border[edge, 1]])
+    edge, vertex = edge[other], vertex[other]
+    close = np.minimum(tolerance, SHARE * length[edge])
+    away = vertices[vertex] - start[edge]
+    share = np.einsum("ij,ij->i", away, along[edge]) / np.maximum(length[edge] ** 2, 1e-300)
+    gap = np.linalg.norm(away - share[:, None] * along[edge], axis=1)
+    inside = (share > SHARE) & (share < 1 - SHARE)
+    result[vertex[(gap <= close) & inside]] = True
+    return result
 
 
 def _edge_length(vertices: np.ndarray, faces: np.ndarray) -> float:

@@ -221,6 +221,7 @@ class Garment:
             seams = coinciding_borders(self.vertices, self.faces)
             if seams.sides:
                 _warn(f"{what}: {seams.found()}. If they are the sides of seams, {SEWING} As they are, they open.")
+            _warn(seams.unjoined())
             result = Simulated(self.vertices, self, np.arange(len(self.vertices)))
         _warn(result.message(what))
         return result
