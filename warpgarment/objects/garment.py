@@ -18,8 +18,10 @@ from warpgarment.geometry.checks import (
     checked_faces,
     checked_pins,
     checked_positions,
+    complain,
     directed_edges,
     far_from_origin,
+    no_area,
     to_numpy,
 )
 from warpgarment.geometry.clean import clean_mesh
@@ -75,7 +77,10 @@ class Garment:
         self.vertices = checked_positions(vertices)
         self.faces = checked_faces(faces, len(self.vertices), remedy=REMEDY)
         self.faces = agreeing(self.vertices, self.faces, f"garment {name!r}" if name else "the garment")
-        _warn(far_from_origin(vertices, self.faces, f"garment {name!r}" if name else "the garment"))
+        far = far_from_origin(vertices, self.faces, f"garment {name!r}" if name else "the garment")
+        if far:
+            complain(no_area(self.vertices, self.faces), "faces", "have no area", far)
+            _warn(far)
         check_rest_mesh(self.vertices, self.faces)
         self.pins = checked_pins(pins, len(self.vertices))
         self.name = str(name)
