@@ -1,7 +1,6 @@
 """If these failed, bodies would be posed wrongly, or broken ones reach the distance queries, which take anything."""
 
 import re
-import warnings
 
 import numpy as np
 import pytest
@@ -187,16 +186,3 @@ def test_pickles_are_never_loaded(tmp_path):
     np.savez(tmp_path / "q.npz", points=np.zeros(3))
     with pytest.raises(wg.MeshError, match="points"):
         wg.BodyMotion.load(tmp_path / "q.npz")
-
-
-def test_a_body_far_from_the_origin_is_said_to_be():
-    """A body would lose a third of its faces to float32 without a word. 20 km: steps of 2 mm."""
-    mesh = trimesh.creation.icosphere(4, 0.5)
-    far = np.asarray(mesh.vertices)[None] + [2e4, 0, 2e4]
-    with pytest.warns(
-        UserWarning, match=r"20 km from the origin.* 2 mm apart: [\d,]+ of 5,120 faces have no area there"
-    ):
-        wg.BodyMotion(far, mesh.faces)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        wg.BodyMotion(np.asarray(mesh.vertices)[None] + [300.0, 0, 0], mesh.faces)

@@ -1,7 +1,6 @@
 """If these failed, broken meshes would reach the solvers, or files would come in with vertices split, lost or moved."""
 
 import re
-import warnings
 
 import igl
 import numpy as np
@@ -397,16 +396,3 @@ def test_cleaning_while_loading(tmp_path):
     with pytest.raises(wg.MeshError, match="clean=True"):
         wg.Garment.load(tmp_path / "m.obj")
     assert len(wg.Garment.load(tmp_path / "m.obj", clean=True).faces) == 80
-
-
-def test_a_garment_far_from_the_origin_is_said_to_be():
-    """Faces would be lost to float32, and the remedy named be to drop them."""
-    vertices, faces = sphere()
-    with pytest.warns(UserWarning, match=r"100 km from the origin, where positions in float32 are 7.8 mm apart"):
-        wg.Garment(vertices.astype(float) * 0.5 + [1e5, 0, 0], faces)
-    small = vertices.astype(float) * 0.01 + [2e4, 0, 0]
-    with pytest.raises(wg.MeshError, match=r"have no area .* Move garment and body to the origin"):
-        wg.Garment(small, faces)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        wg.Garment(vertices.astype(float) + [500.0, 0, 0], faces)

@@ -95,8 +95,8 @@ class Carried:
         points, cloth = np.asarray(points, np.float64), np.asarray(cloth, np.float64)
         faces = np.ascontiguousarray(faces, np.int64)
         self._unit, count = unit, int(unit.max()) + 1
-        anchor = np.stack([np.bincount(unit, points[:, k], count) for k in range(3)], 1)
-        anchor /= np.bincount(unit, minlength=count)[:, None]
+        total = np.stack([np.bincount(unit, points[:, k], count) for k in range(3)], 1)
+        anchor = np.ascontiguousarray(total / np.bincount(unit, minlength=count)[:, None])
         _, face, foot = igl.point_mesh_squared_distance(anchor, cloth, faces)
         self._corners = faces[face]
         a, b, c = (np.ascontiguousarray(cloth[self._corners[:, k]]) for k in range(3))

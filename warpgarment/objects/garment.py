@@ -132,7 +132,7 @@ class Garment:
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh, up=up)
         try:
-            told = {"pins": data.pins, "name": data.name or path.stem}
+            told: dict[str, Any] = {"pins": data.pins, "name": data.name or path.stem}
             garment = (
                 cls.cleaned_from(data.vertices, data.faces, **told, keep=True)
                 if clean
