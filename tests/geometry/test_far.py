@@ -17,6 +17,9 @@ def test_a_body_far_from_the_origin_is_said_to_be():
         UserWarning, match=r"20 km from the origin.* 2 mm apart: [\d,]+ of 5,120 faces have no area there"
     ):
         wg.BodyMotion(far, mesh.faces)
+    walked = np.asarray(mesh.vertices)[None] + np.array([0, 0, 5e4])[None, None] * np.arange(3)[:, None, None]
+    with pytest.warns(UserWarning, match=r"the body in frame 2 is 100 km from the origin"):
+        wg.BodyMotion(walked.astype(np.float32), mesh.faces)  # as most readers give it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         wg.BodyMotion(np.asarray(mesh.vertices)[None] + [300.0, 0, 0], mesh.faces)

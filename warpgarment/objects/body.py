@@ -64,7 +64,10 @@ class BodyMotion:
         self.degenerate_faces = int(np.count_nonzero(flat))
         if flat.all():
             complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
-        far = far_from_origin(to_numpy(vertices)[0], self.faces, "the body")
+        reach = np.maximum(self.vertices.max(axis=(1, 2)), -self.vertices.min(axis=(1, 2)))
+        worst = int(reach.argmax())
+        what = f"the body in frame {worst}" if worst else "the body"
+        far = far_from_origin(to_numpy(vertices)[worst], self.faces, what)
         if far:
             warnings.warn(far, UserWarning, stacklevel=2)
         self.faces = turned_outward(self.vertices[0], self.faces, "the body")
