@@ -50,9 +50,10 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> Cleaned:
 
     Joined are vertices of open borders that are at the same place, see `seams`; vertices inside a surface stay as they
     are. Dropped are vertices that are not finite with their faces, faces with indices out of range, faces that use a
-    vertex twice, have no area or repeat another face; where more than two faces share an edge, the largest two stay.
-    Faces are flipped to agree with the majority, by area, of their component; where no agreement is possible (a Möbius
-    strip) the faces on one side of the seam are dropped. Vertices without a face are dropped last.
+    vertex twice, have no area, or repeat another face or exactly its place, as do those of a mesh with two sides; where
+    more than two faces share an edge, the largest two stay. Faces are flipped to agree with the majority, by area, of
+    their component; where no agreement is possible (a Möbius strip) the faces on one side of the seam are dropped.
+    Vertices without a face are dropped last.
 
     Args:
         vertices: Positions [m], shape [V,3].
@@ -68,6 +69,7 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> Cleaned:
     corners = corners[((corners >= 0) & (corners < len(vertices))).all(axis=1)]
     usable = np.isfinite(vertices).all(axis=1)
     corners = corners[usable[corners].all(axis=1)]
+    corners = corners[_with_area(vertices, _exact(vertices)[corners])]
     seams = coinciding_borders(vertices, corners)
     merged = seams.group
     corners = corners[_with_area(vertices, merged[corners])]
@@ -89,6 +91,12 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> Cleaned:
         count - len(corners),
         seams,
     )
+
+
+def _exact(vertices: np.ndarray) -> np.ndarray:
+    """For each vertex the first at exactly the same place, [V]."""
+    first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)[1:]
+    return np.asarray(first[inverse.reshape(-1)])
 
 
 def _with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
