@@ -148,7 +148,7 @@ def recorded_garment(
             "they belong to different meshes."
         )
     if clean:
-        rest, faces, went = clean_mesh(rest, faces)
+        rest, faces, went = clean_mesh(rest, faces)[:3]
         kept = np.flatnonzero(went >= 0)[::-1]  # backwards, so that of merged vertices the first one counts
         origin = np.empty(len(rest), dtype=np.int64)
         origin[went[kept]] = kept

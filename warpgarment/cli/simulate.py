@@ -14,7 +14,9 @@ from warpgarment.errors import UsageError
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.clock import in_words
+from warpgarment.objects.facts import Facts
 from warpgarment.objects.garment import Garment
+from warpgarment.view.facts import facts_table
 from warpgarment.view.report import rollout_table
 
 from . import spoken
@@ -50,7 +52,8 @@ class Simulate:
     body_mesh: str | None = None
     """Name of the mesh where the body's file holds several."""
     clean: bool = False
-    """Repair the garment's mesh: join vertices at the same place, turn faces that disagree, drop broken ones."""
+    """Join seams (open borders whose vertices are at the same place, within 5 % of the edge length), turn faces that
+    disagree, drop broken ones. Written are all vertices of the file, in its order."""
     fit_rest: Path | None = None
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
     frames: int | None = None
@@ -61,7 +64,7 @@ class Simulate:
 
 
 def run(options: Simulate) -> None:
-    """Loads, fits if asked, rolls out, writes, and says how it went."""
+    """Loads, says what the files hold, fits if asked, rolls out, writes, and says how it went."""
     check_output(options.out, suffixes("write_motion"))
     if isinstance(options.out_fps, float) and not 0 < options.out_fps < math.inf:
         raise UsageError(f"--out-fps {options.out_fps:g}: a positive number of frames a second, body or network.")
@@ -72,6 +75,7 @@ def run(options: Simulate) -> None:
             options.garment, unit=options.unit, up=options.up, mesh=options.garment_mesh, clean=options.clean
         )
     body = _body(options.body, options)
+    print(facts_table({"garment": Facts.of(garment), "body": Facts.of(body)}), end="\n\n", flush=True)
     simulator = Simulator.from_pretrained(options.weights, device=options.device)
     simulator.timings.synchronise = True
     first = None

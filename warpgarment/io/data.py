@@ -77,6 +77,20 @@ class ReadOptions(NamedTuple):
     up: str | None = None
 
 
+class Holds(NamedTuple):
+    """What a file says of itself.
+
+    Attributes:
+        names: Names of the objects (or, of OBJ without objects, groups) that have faces, each of which can be read.
+        metres: Metres in its unit; None: it does not say.
+        up: Axis that points up, "y" or "z"; None: it does not say.
+    """
+
+    names: tuple[str, ...] = ()
+    metres: float | None = None
+    up: str | None = None
+
+
 class Format(NamedTuple):
     """A file format: four functions, each None where the format has no such thing.
 
@@ -97,6 +111,7 @@ class Format(NamedTuple):
         write_motion: Writes one.
         only_read: Suffixes of the format that are read and never written.
         axis: Whether the files say which axis is up, or the format does.
+        holds: Lists what a file holds, without reading its positions; None: one object, without a name.
         named: Whether meshes in a file have names; otherwise `ReadOptions.mesh` is refused before reading.
     """
 
@@ -108,6 +123,7 @@ class Format(NamedTuple):
     only_read: tuple[str, ...] = ()
     named: bool = False
     axis: bool = False
+    holds: Callable[[Path], Holds] | None = None
 
 
 def scale_of(unit: str | None) -> float:

@@ -12,8 +12,8 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_folder
 
-from .data import Format, MotionData, ReadOptions
-from .obj import chosen_polygons, obj_text, read_polygons
+from .data import Format, Holds, MotionData, ReadOptions
+from .obj import chosen_polygons, obj_holds, obj_text, read_polygons
 from .polygons import triangulate_counts
 
 FRAME = "frame_*.obj"
@@ -125,4 +125,9 @@ def write_folder(path: Path, data: MotionData) -> None:
             (folder / f"frame_{frame:0{digits}d}.obj").write_text(text, encoding="utf-8")
 
 
-FORMAT = Format(read_motion=read_folder, write_motion=write_folder, named=True)
+def _holds(path: Path) -> Holds:
+    first = next((file for file in sorted(path.glob("[!.]*")) if file.suffix.lower() == ".obj"), None)
+    return obj_holds(first) if first else Holds()
+
+
+FORMAT = Format(read_motion=read_folder, write_motion=write_folder, named=True, holds=_holds)

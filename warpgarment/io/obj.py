@@ -17,7 +17,7 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_file
 
-from .data import Format, MeshData, ReadOptions
+from .data import Format, Holds, MeshData, ReadOptions
 from .parts import ALL, Parts, connected_pieces, listed, named, unconnected, used_only
 from .polygons import triangulate_counts
 
@@ -193,6 +193,22 @@ def obj_text(vertices: np.ndarray, faces: np.ndarray, name: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
+def obj_holds(path: Path) -> Holds:
+    """Names of the objects of an OBJ file that have faces, or of its groups where it has no two objects."""
+    objects: dict[str, None] = {}
+    groups: dict[str, None] = {}
+    name = group = ""
+    for _, line in _lines(path):
+        if line.startswith("f"):
+            objects[name] = groups[group] = None
+        elif line.startswith(("o ", "o\t")):
+            name = " ".join(line.split()[1:])
+        elif line.startswith(("g ", "g\t")):
+            group = " ".join(line.split()[1:])
+    named = [[name for name in kind if name] for kind in (objects, groups)]
+    return Holds(tuple(named[1] if len(named[0]) < 2 and len(named[1]) > 1 else named[0]))
+
+
 def _read(path: Path, options: ReadOptions) -> MeshData:
     return MeshData(*read_obj(path, options.mesh))
 
@@ -202,4 +218,4 @@ def _write(path: Path, data: MeshData) -> None:
         temporary.write_text(obj_text(data.vertices, data.faces, data.name), encoding="utf-8")
 
 
-FORMAT = Format(read_mesh=_read, write_mesh=_write, named=True)
+FORMAT = Format(read_mesh=_read, write_mesh=_write, named=True, holds=obj_holds)

@@ -16,8 +16,8 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_files
 
-from .data import Format, MotionData, ReadOptions
-from .obj import chosen_polygons, obj_text, read_polygons
+from .data import Format, Holds, MotionData, ReadOptions
+from .obj import chosen_polygons, obj_holds, obj_text, read_polygons
 from .parts import unnamed
 from .ply import read_ply
 from .polygons import triangulate_counts
@@ -133,4 +133,9 @@ def _write(path: Path, data: MotionData) -> None:
         write_pc2_to(cache, data.vertices, start=data.start or 0.0)
 
 
-FORMAT = Format(read_motion=_read, write_motion=_write, named=True)
+def _holds(path: Path) -> Holds:
+    beside = next((p for p in (path.with_suffix(".obj"), path.with_suffix(".OBJ")) if p.exists()), None)
+    return obj_holds(beside) if beside else Holds()
+
+
+FORMAT = Format(read_motion=_read, write_motion=_write, named=True, holds=_holds)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from warpgarment.geometry.checks import (
     checked_fps,
     checked_positions,
     complain,
+    far_from_origin,
     no_area,
     repeated_vertices,
     to_numpy,
@@ -21,6 +23,9 @@ from warpgarment.geometry.checks import (
 from warpgarment.geometry.orientation import turned_outward
 
 from .clock import Clock, between
+
+if TYPE_CHECKING:
+    from warpgarment.io.source import Source
 
 
 class BodyMotion:
@@ -37,6 +42,7 @@ class BodyMotion:
         start: Time of the first frame [s].
         last: When the last frame is reached, in frames after the first: T - 1, or less where resampling put the end of
             the motion on a frame that comes a little later. See `Clock`.
+        source: How its file was read (`warpgarment.io.source.Source`); None for a motion made of arrays.
 
     Args:
         vertices: Positions [m], shape [T,V,3]; NumPy, torch or nested lists.
@@ -48,7 +54,12 @@ class BodyMotion:
     Raises:
         MeshError: The arrays have other shapes, no frames or no faces, numbers that are not finite (named by frame),
             indices out of range, no face with an area, a rate that is not positive, or a time that is none.
+
+    Warns:
+        UserWarning: Faces were turned round; or the body is so far from the origin that float32 cannot tell its shape.
     """
+
+    source: Source | None = None
 
     def __init__(self, vertices: Any, faces: Any, fps: float = 30.0, *, start: float = 0.0, last: float | None = None):
         self.vertices = checked_positions(vertices, frames=True)
@@ -58,6 +69,12 @@ class BodyMotion:
         self.degenerate_faces = int(np.count_nonzero(flat))
         if flat.all():
             complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
+        reach = np.maximum(self.vertices.max(axis=(1, 2)), -self.vertices.min(axis=(1, 2)))
+        worst = int(reach.argmax())
+        what = f"the body in frame {worst}" if worst else "the body"
+        far = far_from_origin(to_numpy(vertices)[worst], self.faces, what)
+        if far:
+            warnings.warn(far, UserWarning, stacklevel=2)
         self.faces = turned_outward(self.vertices[0], self.faces, "the body")
 
     @classmethod
@@ -124,13 +141,19 @@ class BodyMotion:
             FileNotFoundError: There is no such file.
         """
         from warpgarment.io.files import rate_of, read_motion, start_of
+        from warpgarment.io.source import source_of
 
         path = Path(path)
         data = read_motion(path, unit=unit, mesh=mesh, up=up)
         rate = rate_of(path, data, fps)
         try:
             motion = cls(data.vertices, data.faces, rate, start=start_of(data, rate), last=data.last)
-            return motion.submesh(data.collider_faces) if collider and data.collider_faces is not None else motion
+            if collider and data.collider_faces is not None:
+                motion = motion.submesh(data.collider_faces)
+            motion.source = source_of(
+                path, unit=unit, mesh=mesh, up=up, fps=fps, file_fps=data.fps, frames=motion.frames
+            )
+            return motion
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
 

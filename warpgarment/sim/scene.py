@@ -30,6 +30,7 @@ from warpgarment.sim.stages.reconstruct import Reconstruct
 
 from . import memory
 from .bodies import MovingBodies
+from .brought import Brought
 from .surface import Surface
 from .timing import Timings
 
@@ -52,6 +53,7 @@ class Scene:
         timings: Times of the stages, to which each stage adds its own.
         contact_sources: Objects that find contacts, such as `BodyContacts()`.
         correctors: What changes positions after contact.
+        brought: What users brought, where it is more than `garments`.
 
     Attributes:
         contact_sources: List of contact sources; more may be appended before the first frame.
@@ -78,6 +80,7 @@ class Scene:
         timings: Timings,
         contact_sources: Sequence[ContactSource] = (BodyContacts(),),
         correctors: Sequence[Corrector] = (),
+        brought: Brought | None = None,
     ) -> None:
         if network.reads:
             raise ValueError(f"the network reads {', '.join(sorted(network.reads))}, which simulations do not give yet")
@@ -93,6 +96,7 @@ class Scene:
             device=device,
             correctors=self.correctors,
         )
+        self.brought, self.topology = brought, bodies
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
         self.bodies = MovingBodies(body_vertices, bodies)

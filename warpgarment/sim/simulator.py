@@ -30,12 +30,13 @@ from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
 from .arguments import as_array, counted, known_frames, listed, per_garment
+from .brought import Brought
 from .frame import Frame
 from .graph import GraphedFrames
 from .history import History
-from .recording import READ_EVERY, Recording
+from .results.recording import READ_EVERY, Recording, seen
+from .results.shot import Rate, bodies_of_shot, brought_to_shot, frames_needed, rates_of
 from .scene import Scene
-from .shot import Rate, bodies_of_shot, brought_to_shot, frames_needed, rates_of
 from .state import SimulationState, Status, Vertices
 from .timing import Timings
 
@@ -145,9 +146,10 @@ class Simulator:
         """Simulates garments over motions of their bodies, as one batch.
 
         Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
-        network's rate. Results start when their body starts, and last as long. Garments whose motion is shorter stop
-        earlier; one that stops being finite ends with that frame, which holds NaN, with a status that says so and a
-        RuntimeWarning.
+        network's rate. Results start when their body starts, and last as long. All vertices of a garment come back in
+        their order: joined seams are simulated once, small loose pieces are carried by the cloth
+        (`Garment.simulated`). Garments whose motion is shorter stop earlier; one that stops being finite ends with that
+        frame, which holds NaN, with a status that says so and a RuntimeWarning.
 
         Args:
             garment: One garment, or a list.
@@ -184,8 +186,8 @@ class Simulator:
         rates = rates_of(unique, out_fps, fps)
         needed = [frames_needed(frames, rate, fps) for rate in rates]
         motions = [b.resampled(fps, count) for b, count in zip(unique, needed, strict=True)]
-        known = self._known(garments, single, first_vertices, history)
-        given = known.shape[0]
+        brought = self._brought(garments, single, first_vertices, history)
+        given = len(brought.known)
         on = [number[id(b)] for b in bodies]
         shot = bodies_of_shot(unique, rates, frames, garments, on) if any(rate != fps for rate in rates) else None
         lengths = [min(motions[i].frames, needed[i] or 2**62) for i in on]
@@ -202,13 +204,13 @@ class Simulator:
             self.device,
         )
         first = [body_at(frame) for frame in range(given)]
-        states = self._begin(garments, single, packed, known, first, face_splits)
+        states = self._begin(brought, single, packed, first, face_splits)
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         with evaluating(self.network):
             for frame in counted(range(total), progress):
                 state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
-                if not recording.add(state.now.outcome, last=frame == total - 1):
+                if not recording.add(seen(state.scene, state.now), last=frame == total - 1):
                     break
         results = []
         for i, (worn, statuses) in enumerate(zip(garments, recording.statuses, strict=True)):
@@ -216,6 +218,8 @@ class Simulator:
                 label = worn.name or f"garment {i}"
                 warnings.warn(f"{label} stopped: {statuses[-1].message}", RuntimeWarning, stacklevel=2)
             moved = recording.positions[i][: len(statuses)]
+            if history is not None:
+                moved[:given] = brought.given[i]
             clock = motions[on[i]].clock
             last = clock.last if len(moved) == clock.frames else None
             result = GarmentMotion(moved, worn.faces, fps, statuses, worn.name, start=clock.start, last=last)
@@ -278,9 +282,9 @@ class Simulator:
             BodyMotion(as_array(v)[None], f, self.network.config.fps) for v, f in zip(shapes, faces, strict=True)
         ]
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
-        known = self._known(garments, single, first_vertices, None)
+        brought = self._brought(garments, single, first_vertices, None)
         first = self._positions([b.vertices[0] for b in checked])
-        return self._begin(garments, single, packed, known, [first], face_splits)[0]
+        return self._begin(brought, single, packed, [first], face_splits)[0]
 
     def step(
         self, state: SimulationState[Vertices, Status], next_body_vertices: Any
@@ -311,14 +315,14 @@ class Simulator:
     @torch.inference_mode()
     def _begin(
         self,
-        garments: list[Garment],
+        brought: Brought,
         single: bool,
         bodies: PackedBodies,
-        known: torch.Tensor,
         body_frames: list[torch.Tensor],
         face_splits: int,
     ) -> list[SimulationState[Any, Any]]:
-        """States of the known frames [K,V,3]: one for a cold start, H with a history."""
+        """States of the known frames: one for a cold start, H with a history."""
+        garments, known = brought.simulated, torch.from_numpy(brought.known).to(self.device)
         scene = Scene(
             garments,
             bodies,
@@ -332,6 +336,7 @@ class Simulator:
             timings=self.timings,
             contact_sources=self.contact_sources,
             correctors=self.correctors,
+            brought=brought,
         )
         history_length = self.network.config.history
         features = scene.features(known[0], body_frames[0], body_frames[0])
@@ -361,9 +366,8 @@ class Simulator:
             after = state.graph(state.now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
 
-    def _known(self, garments: list[Garment], single: bool, first: Any, history: Any) -> torch.Tensor:
-        frames = known_frames(garments, single, first, history, self.network.config.history)
-        return torch.from_numpy(frames).to(self.device)
+    def _brought(self, garments: list[Garment], single: bool, first: Any, history: Any) -> Brought:
+        return Brought(garments, known_frames(garments, single, first, history, self.network.config.history))
 
     def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
         """Concatenates arrays [*,3] on the device; always a copy, so that callers may reuse their arrays.

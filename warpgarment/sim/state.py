@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from .frame import Frame
 from .graph import GraphedFrames
-from .recording import Outcome, read
+from .results.recording import Outcome, read, seen
 from .scene import Scene
 
 Vertices = TypeVar("Vertices")
@@ -49,4 +49,4 @@ class SimulationState(Generic[Vertices, Status]):
 
     @cached_property
     def _read(self) -> Outcome:
-        return read(self.scene, self.frame, [self.now.outcome])[0]
+        return read(self.scene, self.frame, [seen(self.scene, self.now)])[0]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.io.data import Format, MeshData, MotionData, ReadOptions
+from warpgarment.io.data import Format, Holds, MeshData, MotionData, ReadOptions
 from warpgarment.io.joined import join_exact
 from warpgarment.io.parts import ALL, Parts, connected_pieces, listed, named, unconnected
 from warpgarment.io.times import frames_of
@@ -107,4 +107,14 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     return read_gltf(path, mesh=options.mesh)[0]
 
 
-FORMAT = Format(read_mesh=_read_mesh, read_motion=_read_motion, named=True, axis=True)
+def _holds(path: Path) -> Holds:
+    try:
+        document = Document(path)
+        return Holds(
+            tuple(dict.fromkeys(Scene(document, Channels(_still(document), path), np.zeros(1)).names())), 1.0, "y"
+        )
+    except _DAMAGE:
+        return Holds((), 1.0, "y")
+
+
+FORMAT = Format(read_mesh=_read_mesh, read_motion=_read_motion, named=True, axis=True, holds=_holds)

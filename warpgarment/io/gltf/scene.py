@@ -49,6 +49,16 @@ class Scene:
             if "mesh" in node and (roots is None or self._chain(number)[-1] in roots):
                 self.meshes.append(number)
 
+    def names(self) -> list[str]:
+        """What the meshes of the scene are called, in the order of `meshes`."""
+        return [self._name(number) for number in self.meshes]
+
+    def _name(self, number: int) -> str:
+        """The name of a node, else of its mesh, else its number."""
+        node = self._document.item("nodes", number)
+        name = node.get("name") or self._document.item("meshes", node["mesh"]).get("name")
+        return str(name or f"node {number}")
+
     def _chain(self, number: int) -> list[int]:
         """A node, its parent, and so on."""
         chain = [number]
@@ -91,7 +101,7 @@ class Scene:
         together = [np.broadcast_to(v, (count, *v.shape[1:])) for v in vertices]
         name = str(mesh.get("name", ""))
         return Placed(
-            str(node.get("name", "")) or name or f"node {number}",
+            self._name(number),
             name,
             np.concatenate(together, axis=1) if together else np.zeros((1, 0, 3)),
             np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64),

@@ -6,7 +6,7 @@ import numpy as np
 
 from warpgarment.io.data import Format, MeshData, MotionData, ReadOptions
 
-from .reading import UsdMesh, read_usd
+from .reading import UsdMesh, read_usd, usd_holds
 from .writing import write_usd
 
 __all__ = ["FORMAT", "UsdMesh", "read_usd", "write_usd"]
@@ -34,5 +34,13 @@ def _write_motion(path: Path, data: MotionData) -> None:
 
 
 FORMAT = Format(
-    "usd", _read_mesh, _write_mesh, _read_motion, _write_motion, only_read=(".usdz",), named=True, axis=True
+    "usd",
+    _read_mesh,
+    _write_mesh,
+    _read_motion,
+    _write_motion,
+    only_read=(".usdz",),
+    named=True,
+    axis=True,
+    holds=usd_holds,
 )

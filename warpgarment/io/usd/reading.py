@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.data import Holds
 from warpgarment.io.polygons import triangulate_counts
 from warpgarment.io.times import Frames, frames_of
 
@@ -49,17 +50,8 @@ def read_usd(
         FileNotFoundError: There is no such file.
     """
     _, _, Usd, UsdGeom, _ = pxr()
-    from pxr import Tf
-
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"No such file: {path}")
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException:
-        stage = None
-    if stage is None:
-        raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
+    stage = _opened(path, Usd)
     prim = _choose(stage, mesh, path, Usd, UsdGeom)
     where = f"{path}: mesh {prim.GetName()!r}"
     skinning = skinning_of(prim)
@@ -90,6 +82,32 @@ def read_usd(
     start = float(chosen.codes[0]) * (fps or 1.0) / stage.GetTimeCodesPerSecond() if len(chosen.codes) else 0.0
     with np.errstate(over="ignore"):
         return UsdMesh(prim.GetName(), vertices.astype(np.float32), faces, fps, start)
+
+
+def usd_holds(path: Path) -> Holds:
+    """Meshes that a stage shows, by path where two have the same name, its unit and axis; raises as `read_usd`."""
+    _, _, Usd, UsdGeom, _ = pxr()
+    stage = _opened(path, Usd)
+    prims = [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
+    shown = [p for p in prims if _is_shown(p, Usd, UsdGeom)] or prims
+    names = [p.GetName() for p in shown]
+    names = [name if names.count(name) == 1 else str(p.GetPath()) for name, p in zip(names, shown, strict=True)]
+    up = "z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "y"
+    return Holds(tuple(names), float(UsdGeom.GetStageMetersPerUnit(stage)), up)
+
+
+def _opened(path: Path, Usd: Any) -> Any:
+    from pxr import Tf
+
+    if not path.exists():
+        raise FileNotFoundError(f"No such file: {path}")
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException:
+        stage = None
+    if stage is None:
+        raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
+    return stage
 
 
 def _choose(stage: Any, mesh: str | None, path: Path, Usd: Any, UsdGeom: Any) -> Any:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from warpgarment.objects.status import RolloutStatus
-
-from .scene import Scene
+from warpgarment.sim.frame import Frame
+from warpgarment.sim.scene import Scene
 
 READ_EVERY = 16  # number of frames of a rollout that a GPU computes before the host reads them
 
@@ -29,12 +29,18 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
     Args:
         scene: The scene that the frames belong to.
         first: Number of the first frame.
-        frames: `Frame.outcome` of this and the following frames.
+        frames: `seen` of this and the following frames.
     """
-    positions, finite, depth, solves = (torch.stack(tensors).cpu().numpy() for tensors in zip(*frames, strict=True))
-    found = []
+    positions, finite, depth, solves, *body = (
+        torch.stack(tensors).cpu().numpy() for tensors in zip(*frames, strict=True)
+    )
+    brought, found = scene.brought, []
     for k in range(len(frames)):
         parts = [part.copy() for part in scene.packed.split(positions[k])]
+        if brought is not None:
+            parts = brought.restored(parts)
+        if brought is not None and body:
+            depth[k] = np.maximum(depth[k], brought.depth(parts, torch.from_numpy(body[0][k]), scene.topology))
         for part, sound in zip(parts, finite[k], strict=True):
             if not sound:
                 part[:] = np.nan
@@ -44,6 +50,12 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
         statuses = [RolloutStatus.judged(first + k, bool(f), float(d), *iterations) for f, d in judged]
         found.append(Outcome(parts, statuses, bool(finite[k].any())))
     return found
+
+
+def seen(scene: Scene, frame: Frame) -> tuple[torch.Tensor, ...]:
+    """What `read` reads of a frame: its outcome, and the bodies where vertices are carried that may be inside them."""
+    rides = scene.brought is not None and scene.brought.rides
+    return (*frame.outcome, frame.body) if rides else frame.outcome
 
 
 def _warn_if_stopped(scene: Scene, solves: np.ndarray) -> None:
@@ -64,7 +76,8 @@ class Recording:
 
     def __init__(self, scene: Scene, lengths: Sequence[int], every: int) -> None:
         self.scene, self.lengths, self.every = scene, lengths, every
-        sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, scene.garments, strict=True)]
+        garments = scene.garments if scene.brought is None else scene.brought.garments
+        sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, garments, strict=True)]
         self.positions = [np.full(size, np.nan, np.float32) for size in sizes]
         self.statuses: list[list[RolloutStatus]] = [[] for _ in lengths]
         self._unread: list[tuple[torch.Tensor, ...]] = []

@@ -13,9 +13,9 @@ from warpgarment.geometry.checks import checked_fps
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
+from warpgarment.sim.scene import Scene
 
 from .recording import read
-from .scene import Scene
 
 Rate: TypeAlias = float | Literal["body"] | None
 
@@ -109,9 +109,13 @@ def brought_to_shot(
         if not any(moving):
             continue
         pending = torch.tensor(moving, device=scene.packed.faces.device)
-        cloth = _tensor([_last_finite(motion, frame) for motion in found], pending.device)
-        moved, finite, depth, report = scene.contact(cloth, _tensor(shown, pending.device), pending)
-        outcome = read(scene, frame, [(moved, finite, depth, torch.stack([torch.zeros_like(report), report]))])[0]
+        parts = [_last_finite(motion, frame) for motion in found]
+        cloth = _tensor(parts if scene.brought is None else [scene.brought.reduced(parts)], pending.device)
+        body = _tensor(shown, pending.device)
+        moved, finite, depth, report = scene.contact(cloth, body, pending)
+        tensors = (moved, finite, depth, torch.stack([torch.zeros_like(report), report]))
+        rides = scene.brought is not None and scene.brought.rides
+        outcome = read(scene, frame, [(*tensors, body) if rides else tensors])[0]
         for i in np.flatnonzero(moving):
             found[i].vertices[frame], found[i].status[frame] = outcome.parts[i], outcome.statuses[i]
     return found
