@@ -62,7 +62,7 @@ def check_rate(recorded: float, network: float) -> None:
 
     Args:
         recorded: Frames per second of the recording.
-        network: Those of the network.
+        network: Frames per second of the network.
 
     Raises:
         MeshError: They differ.

@@ -41,8 +41,8 @@ class View:
     start: float | None = None
     """Time of the motions' first frame in seconds, where their files do not say or say something else."""
     body_start: float | None = None
-    """The same for the body's. Motions are shown at the same moments, whatever their rates: those of the first motion's
-    frames that all have."""
+    """Time of the body's first frame in seconds, likewise. Motions of any rates are shown at the same moments: those
+    frames of the first motion that lie in the time of all."""
     out: Path | None = None
     """Draw to this file instead of a window: .mp4 the film, .png a sheet of moments."""
     frames: int = 8
