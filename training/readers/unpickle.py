@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import check_plain, read_plain
 
 from .unpickle_arrays import ArrayMaker, NdarrayToken, PendingDtype, Refusal
 
@@ -79,12 +80,13 @@ def read_pickle(path: str | Path) -> Any:
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
+    check_plain(path)
     size = path.stat().st_size
     if size > LARGEST:
         raise PickleRefused(f"{path}: {size:,} bytes; more than {LARGEST:,} are not read.")
     machine, position = _Machine(SHARE * size + SPARE), 0
     try:
-        for count, (opcode, operand, place) in enumerate(pickletools.genops(BytesIO(path.read_bytes()))):
+        for count, (opcode, operand, place) in enumerate(pickletools.genops(BytesIO(read_plain(path)))):
             position = place or 0
             if count >= OPCODES:
                 raise Refusal(f"more than {OPCODES:,} opcodes")

@@ -16,7 +16,9 @@ from typing import Any
 
 from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import read_json
 from warpgarment.nn import checkpoint
+from warpgarment.training.data.schema import shown
 from warpgarment.training.data.sequence import read_manifest
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.start import train
@@ -25,6 +27,10 @@ from warpgarment.training.train.training_set import folders_of
 from .settings import described, differences
 
 RECORD = "row.json"
+_KINDS: dict[str, tuple[type, ...]] = {  # of its entries
+    "settings": (dict,), "data": (dict,), "complete": (bool,), "file": (str,), "sha256": (str,), "steps": (int,),
+    "hours": (int, float), "validation": (int, float, str),
+}  # fmt: skip
 
 
 class RunMismatch(ValueError):
@@ -120,13 +126,19 @@ def _complete(folder: Path, record: dict[str, Any], config: TrainConfig) -> Run:
 
 def _read(folder: Path) -> dict[str, Any] | None:
     try:
-        record = json.loads((folder / RECORD).read_text("utf-8"))
+        record = read_json(folder / RECORD)
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
         raise RunMismatch(f"{folder / RECORD} cannot be read ({error}); remove the folder") from error
     if not isinstance(record, dict):
         raise RunMismatch(f"{folder / RECORD} is not a JSON object; remove the folder")
+    wrong = [key for key, kinds in _KINDS.items() if not isinstance(record.get(key), (*kinds, type(None)))]
+    if wrong or Path(record.get("file") or "network").name != (record.get("file") or "network"):
+        raise RunMismatch(
+            f"{folder / RECORD} says {shown(record.get((wrong or ['file'])[0]))} for {(wrong or ['file'])[0]}; "
+            "remove the folder"
+        )
     return record
 
 

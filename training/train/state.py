@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 
 from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import check_plain, parsed_json
 from warpgarment.nn.network import GarmentNetwork
 
 
@@ -73,8 +74,9 @@ def load(
         CheckpointError: The file is not a training state, or of another network.
     """
     try:
+        check_plain(path)
         with safe_open(path, framework="pt", device="cpu") as file:
-            progress = json.loads(file.metadata()["progress"])
+            progress = parsed_json(path, file.metadata()["progress"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}
 
         def part(prefix: str) -> dict[str, torch.Tensor]:

@@ -16,6 +16,7 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import open_plain
 
 from .data import Format, MeshData, MotionData, ReadOptions
 from .parts import ALL, Parts, named
@@ -42,7 +43,7 @@ def read_npz(
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
-    with open(path, "rb") as file:
+    with open_plain(path) as file:
         if file.read(len(MAGIC)) == MAGIC:
             raise MeshError(f"{path} is a single array, not an .npz archive.")
     try:

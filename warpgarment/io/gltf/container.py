@@ -11,6 +11,8 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from warpgarment.io.disk.plain import read_plain
+
 KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 LOOKS = ("KHR_mesh_quantization", "KHR_lights_punctual", "KHR_xmp_json_ld")
@@ -31,7 +33,7 @@ class Document:
     """
 
     def __init__(self, path: Path):
-        data = path.read_bytes()
+        data = read_plain(path)
         self._folder, binary = path.parent, None
         if data.startswith(b"glTF"):
             data, binary = _chunks(data)
@@ -106,7 +108,7 @@ class Document:
             path = (self._folder / unquote(str(uri))).resolve()
             if not path.is_relative_to(self._folder.resolve()) or not path.is_file():
                 raise ValueError(f"its buffer {uri!r} is not in its folder")
-            data = path.read_bytes()
+            data = read_plain(path)
         if len(data) < length:
             raise ValueError(f"a buffer of {length:,} bytes holds {len(data):,}")
         return data

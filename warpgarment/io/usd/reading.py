@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import check_plain
 from warpgarment.io.polygons import triangulate_counts
 from warpgarment.io.times import Frames, frames_of
 
@@ -54,6 +55,7 @@ def read_usd(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"No such file: {path}")
+    check_plain(path)
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException:
