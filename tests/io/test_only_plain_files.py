@@ -41,7 +41,7 @@ def test_formats(pipe, suffix):
     """`simulate` would wait for ever for a garment or a body."""
     path = pipe(f"a{suffix}")
     for read in (read_mesh, read_motion):
-        with pytest.raises(MeshError, match="is a pipe, not a plain file|cannot read .pc2 as a mesh"):
+        with pytest.raises(MeshError, match=r"is a pipe, not a plain file|cannot read \.pc2 as a mesh"):
             read(path)
 
 
@@ -75,8 +75,8 @@ def test_checkpoints(pipe, tmp_path):
     """A folder of a network would be waited for: safetensors opens by name whatever is there."""
     pipe("a.safetensors")
     for path in (tmp_path, tmp_path / "a.safetensors"):
-        with pytest.raises(CheckpointError, match="is a pipe|no such file"):
+        with pytest.raises(CheckpointError, match=r"is a pipe|no such file"):
             checkpoint.load(path)
     pipe(shards.INDEX)
-    with pytest.raises(CheckpointError, match="is a pipe|no such file"):
+    with pytest.raises(CheckpointError, match=r"is a pipe|no such file"):
         checkpoint.load(tmp_path)
