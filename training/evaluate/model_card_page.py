@@ -62,7 +62,7 @@ def page(
                 *_training(notes, log),
                 "## Figures",
                 "",
-                *_figures(evaluation),
+                *figures(evaluation),
                 "## Where it fails",
                 "",
                 *_cases(evaluation["sequences"], drawn, rule),
@@ -111,7 +111,7 @@ def _training(notes: Mapping[str, Any], log: Sequence[Mapping[str, Any]]) -> lis
     return lines
 
 
-def _figures(evaluation: Mapping[str, Any]) -> list[str]:
+def figures(evaluation: Mapping[str, Any]) -> list[str]:
     settings, mean, rows = evaluation.get("settings", {}), evaluation["mean"], evaluation["sequences"]
     starts = [start for start in STARTS if start in mean]
     lines = [

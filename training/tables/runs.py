@@ -66,7 +66,7 @@ def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
         RunMismatch: The folder holds another run, or the training stopped before its budget was spent.
     """
     wanted = {"settings": described(config), "data": data}
-    record = _read(folder)
+    record = read_record(folder)
     if record is None:
         if folder.is_dir() and any(folder.iterdir()):
             raise RunMismatch(f"{folder} holds files but no {RECORD}: this command did not start it. Give other --runs")
@@ -124,7 +124,7 @@ def _complete(folder: Path, record: dict[str, Any], config: TrainConfig) -> Run:
     return Run(file, record.get("steps"), record.get("hours"), error if isinstance(error, float) else None)
 
 
-def _read(folder: Path) -> dict[str, Any] | None:
+def read_record(folder: Path) -> dict[str, Any] | None:
     try:
         record = read_json(folder / RECORD)
     except FileNotFoundError:
