@@ -100,7 +100,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"--replay {result.case}: {result.outcome} [{result.story}]")
     if options.out:
         failed = [{"case": str(r.case), "outcome": r.outcome, "story": r.story} for r in found if r.failed]
-        options.out.write_text(json.dumps({"table": lines, "seconds": seconds, "failed": failed}, indent=1), "utf-8")
+        slow = [f"{r.case}: {r.seconds:.2f} s [{r.story}]" for r in sorted(found, key=lambda r: -r.seconds)[:20]]
+        content = {"table": lines, "seconds": seconds, "failed": failed, "slowest": slow}
+        options.out.write_text(json.dumps(content, indent=1), "utf-8")
     return 1 if failures else 0
 
 

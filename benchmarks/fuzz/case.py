@@ -123,7 +123,7 @@ def _step(kind: str, files: dict[str, bytes], rng: Random, story: list[str]) -> 
         return
     if chance < 0.07:
         other = rng.choice(sorted(KINDS))
-        path, content = sound(other)
+        content = sound(other)[1]
         source = rng.choice(sorted(content))
         files[name] = content[source]
         story.append(f"{name}: holds {source}")

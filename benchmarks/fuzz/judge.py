@@ -1,11 +1,15 @@
-"""Whether the outcome of a case is right: a named error of this package, or something that can be what the file says."""
+"""Whether the outcome of a case is right: a named error of this package, or something that can be in such a file."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import re
 import tempfile
+import time
 import traceback
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,39 +18,44 @@ import numpy as np
 from .case import Case, Made, make, sound
 from .kinds import KINDS
 
+Limits = Callable[[], contextlib.AbstractContextManager[None]]
 REFUSED, RIGHT = "refused", "accepted and right"
 
 
-def outcome(case: Case, folder: Path) -> tuple[str, str]:
+def outcome(case: Case, folder: Path, limits: Limits = contextlib.nullcontext) -> tuple[str, str, float]:
     """Makes the files of a case, reads them and judges what comes.
 
     Args:
         case: The case.
         folder: An empty folder.
+        limits: Of the reading.
 
     Returns:
-        `REFUSED`, `RIGHT`, or what is wrong; and what was done to the files.
+        `REFUSED`, `RIGHT`, or what is wrong; what was done to the files; and the seconds of a processor that reading
+        took.
     """
-    made = make(case, folder)
-    kind = KINDS[case.kind]
+    made, kind = make(case, folder), KINDS[case.kind]
+    facts: dict[str, Any] = {}
+    verdict, began = "", time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            facts = kind.read(made.path)
+            with limits():
+                facts = kind.read(made.path)
         except MemoryError:
-            return "asks for too much memory", made.story
+            verdict = "asks for too much memory"
         except Exception as error:
-            return _refusal(error, case, made), made.story
-    return _judged(facts, case, made), made.story
+            verdict = _refusal(error, case, made)
+    seconds = time.process_time() - began
+    return verdict or _judged(facts, case, made), made.story, seconds
 
 
 def _refusal(error: Exception, case: Case, made: Made) -> str:
     own = type(error).__module__.split(".")[0] == "warpgarment"
+    own |= isinstance(error, FileNotFoundError) and not made.path.exists()
     if not own:
         place = traceback.extract_tb(error.__traceback__)
-        where = next(
-            (f for f in reversed(place) if "fuzz" not in f.filename and "site-packages" not in f.filename), None
-        )
+        where = next((f for f in reversed(place) if not re.search("benchmarks|site-packages", f.filename)), None)
         line = f" ({Path(where.filename).name}:{where.lineno})" if where else ""
         return f"{type(error).__name__}{line}: {str(error)[:150]}"
     if made.harmless:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -41,9 +42,13 @@ def body(path: Path) -> Facts:
 
 
 def motion(path: Path) -> Facts:
-    """What `GarmentMotion.load` reads."""
-    found = GarmentMotion.load(path)
-    return {"vertices": found.vertices, "faces": found.faces, "fps": found.fps, "frames": found.frames}
+    """What `GarmentMotion.load` reads. It says which frames of a rollout that failed are not finite."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = GarmentMotion.load(path)
+    told = any("NaN or infinity" in str(one.message) for one in said) or not all(s.finite for s in found.status)
+    vertices = np.nan_to_num(found.vertices) if told else found.vertices
+    return {"vertices": vertices, "faces": found.faces, "fps": found.fps, "frames": found.frames}
 
 
 def write_obj(folder: Path) -> Path:
@@ -135,11 +140,12 @@ def write_stl_binary(folder: Path) -> Path:
     return folder / "a.stl"
 
 
+_COMPONENTS = {"u": 5125, "f": 5126, "B": 5121}
+_SHAPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+
+
 class _Gltf:
     """A glTF document in the making."""
-
-    kinds = {"u": 5125, "f": 5126, "B": 5121}
-    shapes = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
     def __init__(self) -> None:
         self.data, self.views, self.accessors = b"", [], []  # type: ignore[var-annotated]
@@ -148,7 +154,7 @@ class _Gltf:
         """An accessor of an array, by its index."""
         array = np.ascontiguousarray(array, {"u": "<u4", "f": "<f4", "B": "u1"}[kind])
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes})
-        entry = {"componentType": self.kinds[kind], "type": self.shapes[array.shape[1:]], "count": len(array)}
+        entry = {"componentType": _COMPONENTS[kind], "type": _SHAPES[array.shape[1:]], "count": len(array)}
         self.accessors.append(entry | {"bufferView": len(self.views) - 1})
         self.data += array.tobytes() + bytes(-array.nbytes % 4)
         return len(self.accessors) - 1
@@ -157,7 +163,8 @@ class _Gltf:
         """The document."""
         return {
             "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
-            "buffers": [{"byteLength": len(self.data)}], "bufferViews": self.views, "accessors": self.accessors, **parts,
+            "buffers": [{"byteLength": len(self.data)}], "bufferViews": self.views, "accessors": self.accessors,
+            **parts,
         }  # fmt: skip
 
     def binary(self, **parts: Any) -> bytes:

@@ -58,7 +58,7 @@ def log(path: Path) -> Facts:
 
     shown = read_log(path)
     RunLog(path.parent, resumed=12).close()
-    kept = path.read_text("utf-8").splitlines()
+    kept = [line.strip() for line in path.read_text("utf-8").splitlines()]
     return {"shown": json.dumps(shown), "steps": [line["step"] for line in shown], "kept": kept}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import pickle
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,7 @@ def card(folder: Path) -> Facts:
 
     facts = CardFacts.of(folder)
     text = page(facts, {}, Counter(str(m.get("reason")) for m in facts.rejected)) if facts.good else ""
-    return {"page": text}
+    return {"page": re.sub(r"[\d.,]+ MB, [\d,]+ bytes", "", text)}  # which count the manifests too
 
 
 def set_manifest(folder: Path) -> Facts:
@@ -312,12 +313,15 @@ def network(path: Path) -> Facts:
     return facts | {"config": repr(config), "notes": json.dumps(notes, sort_keys=True)}
 
 
+_PROGRESS = {"step": 3, "elapsed": 1.5, "best": 2.5, "pool_step": 2, "recent": [[0.5, 0.25]]}
+
+
 def write_state(folder: Path) -> Path:
     """Where a training stands."""
     from warpgarment.training.train import state
 
     network, average, optimizer = _in_training()
-    state.save(folder / "state.safetensors", network, average, optimizer, {}, {"step": 3, "seconds": 1.5})
+    state.save(folder / "state.safetensors", network, average, optimizer, {}, _PROGRESS)
     return folder / "state.safetensors"
 
 
@@ -347,7 +351,8 @@ def training_state(path: Path) -> Facts:
     for index, values in optimizer.state_dict()["state"].items():
         facts |= {f"{index}.{name}": np.asarray(value) for name, value in values.items()}
     facts |= {name: tensor.numpy() for name, tensor in extra.items()}
-    return facts | {"step": progress["step"] + 0, "updates": average.updates + 0, "seconds": progress["seconds"] + 0.0}
+    facts |= {f"recent {k}": np.array(row) for k, row in enumerate(progress["recent"])}
+    return facts | {"step": progress["step"] + 0, "updates": average.updates + 0, "elapsed": progress["elapsed"] + 0.0}
 
 
 def write_interactions(folder: Path) -> Path:

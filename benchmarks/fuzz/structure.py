@@ -15,8 +15,8 @@ import numpy as np
 from .damage import BYTES, Damage
 
 VALUES: tuple[Any, ...] = (
-    None, True, -1, 0, 1.5, 1e308, 2**31, 2**63, 10**400, float("nan"), float("inf"), "", "x", "../x", "\0", [], {}, [[]],
-    {"a": {}}, [1, "x"], "|<b>`", "9" * 500, ["x"] * 50, [0.0] * 50, 10**9,
+    None, True, -1, 0, 1.5, 1e308, 2**31, 2**63, 10**400, float("nan"), float("inf"), "", "x", "../x", "\0", [], {},
+    [[]], {"a": {}}, [1, "x"], "|<b>`", "9" * 500, ["x"] * 50, [0.0] * 50, 10**9,
 )  # fmt: skip
 _EXTREME = (np.nan, np.inf, -np.inf, 1e30, -1.0, 0.0)
 

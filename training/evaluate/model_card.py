@@ -114,6 +114,12 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
     try:
         result = read_json(path)
         about, mean = result["network"], result["mean"]
+        _objects(about, mean, result.get("settings", {}), result.get("skipped") or {})
+        _objects(about.get("config") or {}, *mean.values())
+        for row in (row for start in mean.values() for row in start.values()):
+            _check_figures(row)
+        if not isinstance(result.get("frames_predicted", 0), int):
+            raise ValueError("a number of frames that is none")
         rows = [row for row in result["sequences"] if row["start"] == "cold" and row["network"] is not None]
         for row in rows:
             _check_row(row)
@@ -130,11 +136,22 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
     return result
 
 
+def _objects(*parts: object) -> None:
+    """Raises TypeError unless all are JSON objects."""
+    if not all(isinstance(part, dict) for part in parts):
+        raise TypeError("a list, a text or a number in place of an object")
+
+
+def _check_figures(figures: object) -> None:
+    """Raises ValueError unless these are numbers by name."""
+    if not isinstance(figures, dict) or not all(v is None or isinstance(v, (int, float)) for v in figures.values()):
+        raise ValueError("figures that are no numbers")
+
+
 def _check_row(row: Mapping[str, Any]) -> None:
     """Raises ValueError where a row of an evaluation holds something else than the page shows."""
     for method in METHODS:
-        if method in row and not all(v is None or isinstance(v, (int, float, str)) for v in row[method].values()):
-            raise ValueError(f"figures of {method} that are no numbers")
+        _check_figures(row.get(method, {}))
     error = row["network"].get("mean_vertex_error_cm")
     if not isinstance(row["sequence"], str) or not isinstance(row["frames"], int):
         raise ValueError("a row that does not name its sequence, or number its frames")

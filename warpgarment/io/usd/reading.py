@@ -49,7 +49,7 @@ def read_usd(
         MissingExtra: usd-core is not installed.
         FileNotFoundError: There is no such file.
     """
-    _, _, Usd, UsdGeom, _ = pxr()
+    _, _, Usd, _, _ = pxr()
     from pxr import Tf
 
     path = Path(path)
@@ -58,10 +58,25 @@ def read_usd(
     check_plain(path)
     try:
         stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException:
-        stage = None
-    if stage is None:
-        raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
+        if stage is None:
+            raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
+        return _read(stage, path, mesh, frames, convert, turn)
+    except Tf.ErrorException as error:  # also while a value is unpacked, when it is first asked for
+        raise MeshError(
+            f"{path}: USD cannot read it ({_words(error)}). It is damaged, cut short, or of another kind."
+        ) from None
+
+
+def _words(error: Exception) -> str:
+    """The end of what USD says; it quotes the file, whose bytes may be no text."""
+    try:
+        return " ".join(str(error).split())[-200:]
+    except UnicodeDecodeError:
+        return "it is not text in UTF-8"
+
+
+def _read(stage: Any, path: Path, mesh: str | None, frames: bool, convert: bool, turn: bool) -> UsdMesh:
+    _, _, Usd, UsdGeom, _ = pxr()
     prim = _choose(stage, mesh, path, Usd, UsdGeom)
     where = f"{path}: mesh {prim.GetName()!r}"
     skinning = skinning_of(prim)
