@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import tyro
 
+from warpgarment.io.disk.outputs import check_space
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
@@ -56,7 +57,7 @@ class Simulate:
 
 def run(options: Simulate) -> None:
     """Loads, fits if asked, rolls out, writes, and says how it went."""
-    check_output(options.out, suffixes("write_motion"))
+    check_output(options.out, suffixes("write_motion"), (options.garment, options.body, options.fit_rest))
     from warpgarment.sim.simulator import Simulator
 
     with spoken(mesh="--garment-mesh", unit="--unit", up="--up", clean="--clean"):
@@ -73,6 +74,8 @@ def run(options: Simulate) -> None:
         whole = _body(options.body, options, collider=False)
         rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
+    frames = min(options.frames or body.frames, body.frames)
+    check_space(options.out, len(garment.vertices) * frames * 12)
     motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, progress=sys.stderr.isatty())
     motion.save(options.out)
     name = garment.name or "garment"
