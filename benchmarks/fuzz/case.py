@@ -128,7 +128,8 @@ def _step(kind: str, files: dict[str, bytes], rng: Random, story: list[str]) -> 
         files[name] = content[source]
         story.append(f"{name}: holds {source}")
         return
-    changes = list(damage.BYTES)
+    basic = damage.COPIES if KINDS[kind].outside else damage.BYTES
+    changes = list(basic)
     if _is_text(kind, name):
         changes += damage.TEXT * 2
     special = structure.STRUCTURE.get(Path(name).suffix)
@@ -141,7 +142,7 @@ def _step(kind: str, files: dict[str, bytes], rng: Random, story: list[str]) -> 
             files[name] = data
             story.append(f"{name}: {change.__name__}")
             return
-        changes = list(damage.BYTES)
+        changes = list(basic)
 
 
 def clear(folder: Path) -> None:

@@ -169,5 +169,6 @@ def returns(data: bytes, rng: Random) -> bytes | None:
 
 
 BYTES: tuple[Damage, ...] = (cut, cut, flip, flip, overwrite, splice, remove, append, number, number, nothing)
+COPIES: tuple[Damage, ...] = (cut, cut, append, nothing)
 TEXT: tuple[Damage, ...] = (other_number, other_number, lines_again, lines_apart, lines_gone, words, words, deep)
 HARMLESS: tuple[Damage, ...] = (spaces, returns)

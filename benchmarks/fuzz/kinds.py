@@ -23,6 +23,8 @@ class Kind(NamedTuple):
         noticed: Suffixes of files of which no byte may be another without an error or a problem that is told.
         constant: Whether what is read never differs from what was written, whatever the damage.
         text: Whether the files are text although their suffix does not say so.
+        outside: Whether another library takes the file apart that trusts what is inside: the damage is that of copies
+            that went wrong (cut short, empty, longer, another file), not of single bytes within.
     """
 
     write: Callable[[Path], Path]
@@ -31,6 +33,7 @@ class Kind(NamedTuple):
     noticed: tuple[str, ...] = ()
     constant: bool = False
     text: bool = False
+    outside: bool = False
 
 
 KINDS: dict[str, Kind] = {
@@ -47,8 +50,8 @@ KINDS: dict[str, Kind] = {
     "gltf": Kind(meshes.write_gltf, meshes.body),
     "usda": Kind(meshes.write_usda, meshes.body),
     "usda_skeleton": Kind(meshes.write_skeleton, meshes.body),
-    "usdc": Kind(meshes.write_usdc, meshes.motion),
-    "usdz": Kind(meshes.write_usdz, meshes.motion),
+    "usdc": Kind(meshes.write_usdc, meshes.motion, outside=True),
+    "usdz": Kind(meshes.write_usdz, meshes.motion, outside=True),
     "pc2": Kind(meshes.write_pc2, meshes.motion),
     "npz_garment": Kind(meshes.write_garment_npz, meshes.garment),
     "npz_motion": Kind(meshes.write_motion_npz, meshes.motion),
