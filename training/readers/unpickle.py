@@ -99,7 +99,7 @@ def read_pickle(path: str | Path) -> Any:
             f"{path}: {refusal} at byte {position:,} refused. Only plain NumPy arrays, dictionaries, lists, text and "
             "numbers are read; nothing of the file was executed. If you trust it, save it as .npz where it was made."
         ) from None
-    except (ValueError, IndexError, KeyError, TypeError, OverflowError, MemoryError) as error:
+    except (ValueError, IndexError, KeyError, TypeError, OverflowError, MemoryError, SystemError) as error:
         raise PickleRefused(
             f"{path}: not a readable pickle ({type(error).__name__} after byte {position:,}: {str(error)[:200]}). "
             "It is damaged, cut short, or of another kind."
