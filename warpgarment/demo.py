@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.io.disk.outputs import check_writable
+from warpgarment.io.npz import read_npz
 from warpgarment.io.usd import write_usd
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
@@ -76,14 +77,9 @@ def assets(folder: str | Path | None = None) -> DemoAssets:
     garments = {}
     for name in GARMENTS:
         path = folder / f"{name}.npz"
-        with np.load(path, allow_pickle=False) as arrays:
-            missing = {"rest_vertices", "faces", "pins", "truth"} - set(arrays)
-            if missing:
-                raise MeshError(f"{path}: {sorted(missing)[0]!r} is missing; the demo's garments need it")
-            garment = Garment(arrays["rest_vertices"], arrays["faces"], pins=arrays["pins"], name=name)
-            truth = GarmentMotion(
-                arrays["truth"].astype(np.float32), garment.faces, body.fps, name=name, start=body.start
-            )
+        arrays = read_npz(path, ("rest_vertices", "faces", "pins", "truth"))
+        garment = Garment(arrays["rest_vertices"], arrays["faces"], pins=arrays["pins"], name=name)
+        truth = GarmentMotion(arrays["truth"].astype(np.float32), garment.faces, body.fps, name=name, start=body.start)
         if truth.frames > body.frames:
             raise MeshError(f"{path}: {truth.frames} frames of ground truth, the body has {body.frames}")
         garments[name] = DemoGarment(garment, truth)

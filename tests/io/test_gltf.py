@@ -342,3 +342,21 @@ def test_a_crowd_of_instances_does_not_fill_memory(tmp_path):
     )
     with pytest.raises(wg.MeshError, match="frames of 10,000 meshes would take"):
         wg.BodyMotion.load(tmp_path / "m.glb")
+
+
+def test_a_fault_of_the_reader_is_no_damage(tmp_path, monkeypatch):
+    """A fault of this package would be told to users as damage of their file, and never be found."""
+    from warpgarment.io.gltf import scene
+
+    path = tmp_path / "m.glb"
+    writer, document = whole()
+    writer.write(path, **document)
+    for fault in (KeyError("x"), IndexError("x"), TypeError("x"), ValueError("x"), AttributeError("x")):
+
+        def broken(*_, fault=fault):
+            raise fault
+
+        monkeypatch.setattr(scene.Scene, "placed", broken)
+        with pytest.raises(type(fault)) as raised:
+            wg.BodyMotion.load(path)
+        assert not isinstance(raised.value, wg.MeshError)

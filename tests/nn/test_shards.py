@@ -225,7 +225,7 @@ def test_index_that_leaves_the_folder(folder, name):
     [
         ("{", "not JSON"),
         (b"\xff\xfe", "not JSON"),
-        ("[1]", "weight_map or metadata"),
+        ("[1]", "not a JSON object"),
         ('{"metadata": {"total_size": 1}, "weight_map": {}}', "weight_map or metadata"),
         ('{"metadata": {}, "weight_map": {"a": "b.safetensors"}}', "weight_map or metadata"),
     ],

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from warpgarment.objects.material import Material
+from warpgarment.training.data.schema import MOST_FRAMES, MOST_PLANNED
 from warpgarment.training.data.splits import split_of_clips, split_of_number
 from warpgarment.training.garments.outfits import OutfitPattern, sampled_outfit
 from warpgarment.training.garments.pattern import CATEGORIES, sampled_pattern
@@ -108,6 +109,11 @@ class GenerateConfig:
         for name in ("sequences", "frames", "faces", "attempts", "workers", "worlds"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if not 0 <= self.first <= MOST_PLANNED or self.sequences > MOST_PLANNED or self.frames > MOST_FRAMES:
+            raise ConfigurationError(
+                f"{self.sequences:,} sequences of {self.frames:,} frames, from number {self.first:,}: there are at "
+                f"most {MOST_PLANNED:,} in a set, of {MOST_FRAMES:,} frames, numbered from 0."
+            )
         if self.motions is not None and not list_clips(Path(self.motions)):
             raise FileNotFoundError(f"no .bvh or .npz clips in {self.motions}")
 

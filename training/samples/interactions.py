@@ -30,6 +30,7 @@ import torch
 
 import warpgarment
 from warpgarment.io.disk.atomic import atomic_folder
+from warpgarment.io.disk.plain import JSON_LARGEST, open_plain, read_plain
 from warpgarment.kernels.deformation.gradients import face_centroids
 from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction
@@ -162,7 +163,7 @@ def _manifest(place: Path) -> str:
     sums = {}
     for path in sorted(place.glob("*.npy")):
         value = 0
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             while block := file.read(2**20):
                 value = zlib.crc32(block, value)
         sums[path.name] = f"{value:08x}"
@@ -172,9 +173,9 @@ def _manifest(place: Path) -> str:
 def _whole(place: Path, names: list[str]) -> bool:
     """Whether a folder has these files, and all its files have the checksums of its manifest."""
     try:
-        manifest = (place / MANIFEST).read_text("utf-8")
+        manifest = read_plain(place / MANIFEST, JSON_LARGEST).decode("utf-8")
         return all((place / name).exists() for name in names) and manifest == _manifest(place)
-    except (OSError, UnicodeDecodeError):
+    except (OSError, ValueError):
         return False
 
 

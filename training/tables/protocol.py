@@ -24,6 +24,7 @@ from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import check_rate, predict, rigid, skinned
 from warpgarment.training.train.training_set import reason_of
+from warpgarment.view.markdown import escape
 
 METHODS = ("network", "skinned", "rigid")
 STARTS = ("warm", "cold")
@@ -183,7 +184,7 @@ def skipped_lines(skipped: dict[str, str]) -> list[str]:
     if not skipped:
         return []
     count = f"{len(skipped)} sequence{'s' if len(skipped) > 1 else ''} skipped:"
-    return [count, "", *(f"- {name}: {reason}" for name, reason in sorted(skipped.items()))]
+    return [count, "", *(f"- {escape(f'{name}: {reason}')}" for name, reason in sorted(skipped.items()))]
 
 
 def plain(value: Any) -> Any:

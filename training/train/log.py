@@ -10,6 +10,9 @@ from typing import Any
 from tqdm import tqdm
 
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import parsed_json, read_plain
+
+LOG_LARGEST = 1 << 30  # bytes of a log that is read
 
 
 class RunLog:
@@ -62,14 +65,14 @@ def json_number(value: Any) -> Any:
 
 
 def _lines(path: Path) -> list[str]:
-    return path.read_text("utf-8", errors="replace").splitlines() if path.exists() else []
+    return read_plain(path, LOG_LARGEST).decode("utf-8", errors="replace").splitlines() if path.exists() else []
 
 
 def _step(line: str) -> float:
     """The step of an entry; infinity for a line that is not an entry, such as an incomplete one."""
     try:
-        return float(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
+        return float(parsed_json("", line)["step"])
+    except (ValueError, KeyError, TypeError, OverflowError):
         return math.inf
 
 

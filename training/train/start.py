@@ -25,6 +25,7 @@ import torch
 
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.leftovers import remove_leftovers
+from warpgarment.io.disk.outputs import check_space, check_writable
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import architecture, build_network
 from warpgarment.training.distributed import Group, GroupError
@@ -41,6 +42,9 @@ from .training_set import NoTrainingData, load_sequences, load_validation, repor
 __all__ = ["CompileFailed", "GroupError", "NoTrainingData", "NonFiniteLoss", "Run", "TrainConfig", "train"]
 
 
+KEPT = 10  # times the weights: those of two networks, and a state of four sets, written beside the old one
+
+
 def train(config: TrainConfig) -> Path:
     """Trains a network, together with the other processes if torchrun started several.
 
@@ -54,8 +58,10 @@ def train(config: TrainConfig) -> Path:
         CompileFailed: `compile` is set, and compilation failed.
         CheckpointError: `init` or the state to resume from cannot be read or does not fit.
         GroupError: The processes cannot work together.
+        OutputError: `out` cannot be written to, or the disk has no room for the networks and the state.
     """
     began = time.monotonic()
+    check_writable(Path(config.out), folder=True)
     if config.threads:
         torch.set_num_threads(config.threads)
     with Group(config.device) as group:
@@ -71,6 +77,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
         network = architecture(wanted.architecture).start_from(given, wanted, grow=config.grow)
     else:
         network = build_network(config.network_config()).to(group.device)
+    check_space(Path(config.out), KEPT * 4 * network.parameter_count())
     skipped: dict[str, str] = {}
     try:
         sequences = load_sequences(config, network.config, skipped, group)

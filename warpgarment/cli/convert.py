@@ -38,7 +38,7 @@ class Convert:
 
 def run(options: Convert) -> None:
     """Reads, resamples if asked, writes."""
-    check_output(options.output, suffixes("write_motion"))
+    check_output(options.output, suffixes("write_motion"), (options.input,))
     with spoken(mesh="--mesh", unit="--unit", fps="--input-fps", up="--up"):
         motion = BodyMotion.load(
             options.input,

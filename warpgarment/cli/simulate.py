@@ -11,6 +11,7 @@ from typing import Any, Literal
 import tyro
 
 from warpgarment.errors import UsageError
+from warpgarment.io.disk.outputs import check_space
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.clock import in_words
@@ -65,7 +66,7 @@ class Simulate:
 
 def run(options: Simulate) -> None:
     """Loads, says what the files hold, fits if asked, rolls out, writes, and says how it went."""
-    check_output(options.out, suffixes("write_motion"))
+    check_output(options.out, suffixes("write_motion"), (options.garment, options.body, options.fit_rest))
     if isinstance(options.out_fps, float) and not 0 < options.out_fps < math.inf:
         raise UsageError(f"--out-fps {options.out_fps:g}: a positive number of frames a second, body or network.")
     from warpgarment.sim.simulator import Simulator
@@ -88,6 +89,9 @@ def run(options: Simulate) -> None:
     rate = None if options.out_fps == "network" else options.out_fps
     known: dict[str, Any] = {"first_vertices": first, "frames": options.frames, "out_fps": rate}
     with spoken(fps="--body-fps or --out-fps"):
+        fps = body.fps if rate == "body" else rate or simulator.network.config.fps
+        frames = body.clock.resampled(fps, options.frames)[0].frames
+        check_space(options.out, len(garment.vertices) * frames * 12)
         motion = simulator.rollout(garment, body, **known, progress=sys.stderr.isatty())
         motion.save(options.out)
     name = garment.name or "garment"

@@ -13,6 +13,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError, UsageError
 from warpgarment.io.disk.outputs import names_folder
+from warpgarment.io.disk.plain import check_plain
 
 from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
 from .parts import unnamed
@@ -205,6 +206,8 @@ def _placed(vertices: np.ndarray, scale: float, up: str | None) -> np.ndarray:
 def _reader(path: Path, ability: Literal["read_mesh", "read_motion"], options: ReadOptions) -> Format:
     if not path.exists():
         raise FileNotFoundError(f"No such file: {path}")
+    if not path.is_dir():
+        check_plain(path)
     suffix, able = "" if path.is_dir() else path.suffix.lower(), suffixes(ability)
     if suffix in able and (suffix or path.is_dir()):
         format = format_of(suffix)

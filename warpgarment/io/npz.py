@@ -9,13 +9,14 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, cast
 
 import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import open_plain
 
 from .data import Format, MeshData, MotionData, ReadOptions
 from .parts import ALL, Parts, named
@@ -43,7 +44,7 @@ def read_npz(
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
-    with open(path, "rb") as file:
+    with open_plain(path) as file:
         if file.read(len(MAGIC)) == MAGIC:
             raise MeshError(f"{path} is a single array, not an .npz archive.")
     try:
@@ -62,6 +63,26 @@ def read_npz(
         ) from None
 
 
+def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape of an array, whether it lies by columns, and its type, from the beginning of a .npy file.
+
+    Raises:
+        ValueError: The file does not begin as one, or its header is no header. NumPy parses it as Python's syntax, with
+            every error that Python's parsers have.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, by_columns, dtype = read(file)
+    except OSError:
+        raise
+    except Exception as error:  # TokenError, SyntaxError, RecursionError, OverflowError, ...
+        raise ValueError(f"no header of an array ({type(error).__name__}: {str(error)[:100]})") from None
+    if min(shape, default=0) < 0:
+        raise ValueError(f"no header of an array (its shape is {list(shape)})")
+    return shape, by_columns, dtype
+
+
 def _array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     """One array; whatever the libraries underneath make of a damaged one becomes a MeshError."""
     name = member.filename
@@ -72,14 +93,12 @@ def _array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.
         )
     try:
         with archive.open(member) as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, by_columns, dtype = read(file)
+            shape, by_columns, dtype = array_header(file)
             header = file.tell()
             if dtype.hasobject or dtype.names or dtype.itemsize == 0:
                 raise ValueError("pickled objects or records")
             size = dtype.itemsize * math.prod(shape)
-            if size != member.file_size - header or min(shape, default=0) < 0:
+            if size != member.file_size - header:
                 raise ValueError(f"shape {list(shape)} where there are {member.file_size - header:,} bytes")
             data = bytearray(size)
             if cast(BufferedIOBase, file).readinto(data) != size or file.read(1):

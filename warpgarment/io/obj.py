@@ -16,6 +16,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import read_plain
 
 from .data import Format, Holds, MeshData, ReadOptions
 from .parts import ALL, Parts, connected_pieces, listed, named, unconnected, used_only
@@ -149,10 +150,7 @@ def read_polygons(path: Path) -> ObjMesh:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines that say something, without comments; lines of numbers with those that continue them."""
-    try:
-        data = path.read_bytes()
-    except IsADirectoryError:
-        raise MeshError(f"{path} is a folder, not an OBJ file.") from None
+    data = read_plain(path, text=True)
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = data.decode("utf-16" if wide else "utf-8-sig", errors="replace" if wide else "surrogateescape")
     if "\0" in text[:4096]:

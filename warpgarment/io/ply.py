@@ -9,6 +9,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import read_plain
 
 from .data import Format, MeshData, ReadOptions
 from .polygons import triangulate_counts
@@ -50,7 +51,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         MeshError: Not a PLY file, cut short, or a face names a vertex that does not exist.
     """
     path = Path(path)
-    data = path.read_bytes()
+    data = read_plain(path)
     try:
         order, elements, body = _header(data)
         source = _Ascii(body) if order == "" else _Binary(body, order)

@@ -17,14 +17,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 
-from warpgarment.errors import CheckpointError
+from warpgarment.errors import CheckpointError, MeshError
 from warpgarment.io.disk.atomic import atomic_folder
+from warpgarment.io.disk.plain import JSON_LARGEST, check_plain, read_plain
+
+from .bounds import checked_json
 
 SINGLE = "model.safetensors"  # name of the file if one is enough; there is no index then
 INDEX = "model.safetensors.index.json"
@@ -199,11 +201,11 @@ def _read_index(folder: Path) -> tuple[dict[str, str], int]:
     """Name of the file that holds each tensor, and the size of all tensors [bytes]."""
     path = folder / INDEX
     try:
-        index: Any = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        text = read_plain(path, JSON_LARGEST).decode("utf-8")
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: is not JSON ({error}); {_AGAIN}") from error
-    weight_map = index.get("weight_map") if isinstance(index, dict) else None
-    about = index.get("metadata") if isinstance(index, dict) else None
+    index = checked_json(path, "the index", text)
+    weight_map, about = index.get("weight_map"), index.get("metadata")
     total = about.get("total_size") if isinstance(about, dict) else None
     if not isinstance(weight_map, dict) or not weight_map or type(total) is not int:
         raise CheckpointError(f"{path}: weight_map or metadata.total_size is missing; {_AGAIN}")
@@ -218,9 +220,10 @@ def _read_index(folder: Path) -> tuple[dict[str, str], int]:
 def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
     """Metadata and shapes of one file."""
     try:
+        check_plain(path)
         with safe_open(path, framework="pt", device="cpu") as file:
             return dict(file.metadata() or {}), {k: tuple(file.get_slice(k).get_shape()) for k in file.keys()}
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, MeshError) as error:
         raise CheckpointError(
             f"{path}: not a safetensors file, or one cut short ({error}); get it again or check the path"
         ) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -157,6 +158,9 @@ class GarmentMotion:
         Raises:
             MeshError: The file is not of its kind, is damaged, or has no rate.
             FileNotFoundError: There is no such file.
+
+        Warns:
+            UserWarning: Frames hold NaN or infinity without a status that says so.
         """
         from warpgarment.io.files import rate_of, read_motion, start_of
 
@@ -174,9 +178,19 @@ class GarmentMotion:
                 status = [RolloutStatus(*row) for row in rows]
             name = str(data.extra["name"]) if "name" in data.extra else path.stem
             start = start_of(data, rate)
-            return cls(data.vertices, data.faces, rate, status, name, start=start, last=data.last)
+            motion = cls(data.vertices, data.faces, rate, status, name, start=start, last=data.last)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
+        said = np.array([not one.finite for one in status] or [False] * motion.frames)
+        bad = ~np.isfinite(motion.vertices).all(axis=(1, 2)) & ~said
+        if bad.any():
+            warnings.warn(
+                f"{path}: {bad.sum():,} of {motion.frames:,} frames hold NaN or infinity (first: frame "
+                f"{int(bad.argmax())}), and the file does not say that a rollout failed. It may be damaged.",
+                UserWarning,
+                stacklevel=2,
+            )
+        return motion
 
     def _status_arrays(self) -> dict[str, np.ndarray]:
         arrays = {"name": np.array(self.name)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +15,9 @@ from warpgarment.io.times import frames_of
 from .animation import Channels
 from .container import Document
 from .scene import Placed, Scene
+from .schema import Damaged
 
 LARGEST, RATIO = 256 << 20, 1_000  # bytes of positions from which on a file must have a thousandth of them
-_DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, struct.error)
 
 
 def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tuple[MotionData, str]:
@@ -49,12 +48,9 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
                 f"of {document.size:,}. More than {LARGEST:,} are read only of files with a thousandth of that."
             )
         placed = [scene.placed(number) for number in scene.meshes]
-    except MeshError:
-        raise
-    except _DAMAGE as error:
+    except Damaged as error:
         raise MeshError(
-            f"{path}: not a readable glTF file ({type(error).__name__}: {str(error)[:200]}). "
-            "It is damaged, cut short, or of another kind."
+            f"{path}: not a readable glTF file ({str(error)[:200]}). It is damaged, cut short, or of another kind."
         ) from None
     placed = [one for one in placed if len(one.faces)]
     if not placed:
@@ -113,7 +109,7 @@ def _holds(path: Path) -> Holds:
         return Holds(
             tuple(dict.fromkeys(Scene(document, Channels(_still(document), path), np.zeros(1)).names())), 1.0, "y"
         )
-    except _DAMAGE:
+    except Damaged:
         return Holds((), 1.0, "y")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,6 +11,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.data import Holds
+from warpgarment.io.disk.plain import check_plain
 from warpgarment.io.polygons import triangulate_counts
 from warpgarment.io.times import Frames, frames_of
 
@@ -49,9 +52,13 @@ def read_usd(
         MissingExtra: usd-core is not installed.
         FileNotFoundError: There is no such file.
     """
-    _, _, Usd, UsdGeom, _ = pxr()
     path = Path(path)
-    stage = _opened(path, Usd)
+    with _opened(path) as stage:
+        return _read(stage, path, mesh, frames, convert, turn)
+
+
+def _read(stage: Any, path: Path, mesh: str | None, frames: bool, convert: bool, turn: bool) -> UsdMesh:
+    _, _, Usd, UsdGeom, _ = pxr()
     prim = _choose(stage, mesh, path, Usd, UsdGeom)
     where = f"{path}: mesh {prim.GetName()!r}"
     skinning = skinning_of(prim)
@@ -87,27 +94,40 @@ def read_usd(
 def usd_holds(path: Path) -> Holds:
     """Meshes that a stage shows, by path where two have the same name, its unit and axis; raises as `read_usd`."""
     _, _, Usd, UsdGeom, _ = pxr()
-    stage = _opened(path, Usd)
-    prims = [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
-    shown = [p for p in prims if _is_shown(p, Usd, UsdGeom)] or prims
-    names = [p.GetName() for p in shown]
-    names = [name if names.count(name) == 1 else str(p.GetPath()) for name, p in zip(names, shown, strict=True)]
-    up = "z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "y"
-    return Holds(tuple(names), float(UsdGeom.GetStageMetersPerUnit(stage)), up)
+    with _opened(path) as stage:
+        prims = [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
+        shown = [p for p in prims if _is_shown(p, Usd, UsdGeom)] or prims
+        names = [p.GetName() for p in shown]
+        names = [name if names.count(name) == 1 else str(p.GetPath()) for name, p in zip(names, shown, strict=True)]
+        up = "z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "y"
+        return Holds(tuple(names), float(UsdGeom.GetStageMetersPerUnit(stage)), up)
 
 
-def _opened(path: Path, Usd: Any) -> Any:
-    from pxr import Tf
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The stage of a file; what USD finds damaged, also while a value is unpacked when it is first read, is named."""
+    from pxr import Tf, Usd
 
     if not path.exists():
         raise FileNotFoundError(f"No such file: {path}")
+    check_plain(path)
     try:
         stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException:
-        stage = None
-    if stage is None:
-        raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
-    return stage
+        if stage is None:
+            raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
+        yield stage
+    except Tf.ErrorException as error:
+        raise MeshError(
+            f"{path}: USD cannot read it ({_words(error)}). It is damaged, cut short, or of another kind."
+        ) from None
+
+
+def _words(error: Exception) -> str:
+    """The end of what USD says; it quotes the file, whose bytes may be no text."""
+    try:
+        return " ".join(str(error).split())[-200:]
+    except UnicodeDecodeError:
+        return "it is not text in UTF-8"
 
 
 def _choose(stage: Any, mesh: str | None, path: Path, Usd: Any, UsdGeom: Any) -> Any:
