@@ -86,7 +86,8 @@ def displacement(
     if override is not None:
         if delta is None:
             delta = np.zeros((history, *override.shape[1:]), np.float32)
-        delta[-len(override) :] += override
+        newest = override[-history:]
+        delta[-len(newest) :] += newest
     return delta
 
 

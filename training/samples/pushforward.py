@@ -61,10 +61,10 @@ class Pool:
             for k in range(len(displacement))
         ]
 
-    def entry(self, rollout: int, last: int, history: int = 10) -> tuple[int, int, np.ndarray]:
-        """Sequence, newest frame, and displacements of at most `history` newest frames [m], [K,V,3], oldest first."""
+    def entry(self, rollout: int, last: int) -> tuple[int, int, np.ndarray]:
+        """Sequence, newest frame, and displacements of the frames up to it [m], [last + 1, V, 3], oldest first."""
         sequence, first, displacement = self.rollouts[rollout]
-        return sequence, first + last, displacement[max(0, last + 1 - history) : last + 1]
+        return sequence, first + last, displacement[: last + 1]
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """The pool as tensors, for the saved training state."""

@@ -6,6 +6,7 @@ import inspect
 import itertools
 import typing
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from warpgarment.nn.run import rotate_output
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.samples import interactions
 from warpgarment.training.samples.augmentation import Augmentation, mirror
+from warpgarment.training.samples.drawing import displacement
 from warpgarment.training.samples.noise import NoiseBasis, NoiseConfig
 from warpgarment.training.samples.recorded import SequenceData
 from warpgarment.training.samples.single_step import SampleBuilder
@@ -213,6 +215,20 @@ def test_noise_has_the_stated_size_and_spares_pins():
     moved = held.displacement(3, NoiseConfig(clean=0.0), rng)
     assert np.abs(moved[:, pins]).max() == 0.0
     assert np.abs(moved[:, -16:]).max() > 1e-4
+
+
+def test_a_history_starts_from_the_newest_frames_of_a_longer_rollout():
+    """A network with a short history could not be trained on its own rollouts, or would get the oldest frames."""
+    vertices, faces = synthetic_sequences.tube(8, 4, 0.2, 0.0, 1.0)
+    still = NoiseBasis(faces, np.zeros(len(vertices), int), np.zeros(0, int))
+    sequence = SimpleNamespace(noise=still)
+    config, rng = NoiseConfig(clean=1.0), np.random.default_rng(0)
+    rollout = np.arange(6, dtype=np.float32)[:, None, None] * np.ones((1, len(vertices), 3), np.float32)
+    moved = displacement(sequence, 4, config, rng, rollout)
+    np.testing.assert_array_equal(moved, rollout[-4:])
+    moved = displacement(sequence, 8, config, rng, rollout)
+    np.testing.assert_array_equal(moved[:2], 0.0)
+    np.testing.assert_array_equal(moved[2:], rollout)
 
 
 def test_loss_is_the_weighted_sum_of_absolute_differences():
