@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-SPLITS = ("train", "validation", "test")
-
 
 def split_of_number(number: int) -> str:
     """The split of a sequence: of 24, three are for testing and one is for validation (200 : 10 : 30 of 240)."""

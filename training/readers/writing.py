@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.training.data.layout import SPLITS
 from warpgarment.training.data.sequence import write_sequence
 
 from .recording import Recording
-
-SPLITS = ("train", "validation", "test")
 
 
 def write_as_sequence(

@@ -23,9 +23,9 @@ class Verdict(enum.Enum):
 
 
 _MESSAGES = {
-    Verdict.OK: "Every number is finite and no vertex lies deep in the body.",
+    Verdict.OK: "Every number is finite and nothing of the garment is deep in the body.",
     Verdict.PENETRATING: (
-        "A vertex lies deep in the body. Start from a garment outside it (wg.fit), raise collision_passes, "
+        "Part of the garment is deep in the body. Start from a garment outside it (wg.fit), raise collision_passes, "
         "or drop squeezed parts such as hands with BodyMotion.submesh."
     ),
     Verdict.NOT_FINITE: (
