@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warpgarment.errors import UsageError
+from warpgarment.io.surface.record import Surface
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
@@ -21,12 +22,15 @@ class MeshData(NamedTuple):
         faces: Vertex indices, counter-clockwise seen from outside, shape [F,3].
         pins: Vertex indices, shape [P], in formats that keep them.
         name: Of the mesh inside the file; empty where it has none.
+        surface: Its polygons, texture coordinates and materials; None: nothing that the triangles do not say. Where
+            there is one, `faces` are its polygons as `triangulate_counts` cuts them.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     pins: np.ndarray | None = None
     name: str = ""
+    surface: Surface | None = None
 
 
 class MotionData(NamedTuple):
@@ -41,6 +45,7 @@ class MotionData(NamedTuple):
         extra: Further arrays by name, in formats that keep them.
         step: How many frames of the rate lie between two of these, as the file says; `fps` is for one of them.
         start: Number of the first frame, in steps.
+        surface: As of `MeshData`.
     """
 
     vertices: np.ndarray
@@ -51,6 +56,7 @@ class MotionData(NamedTuple):
     extra: Mapping[str, np.ndarray] = {}
     step: float = 1.0
     start: float = 0.0
+    surface: Surface | None = None
 
 
 class ReadOptions(NamedTuple):

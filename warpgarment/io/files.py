@@ -112,7 +112,7 @@ def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None,
     else:
         assert format.read_mesh is not None
         single = format.read_mesh(path, options)
-        data = MotionData(np.asarray(single.vertices)[None], single.faces, name=single.name)
+        data = MotionData(np.asarray(single.vertices)[None], single.faces, name=single.name, surface=single.surface)
     data = data._replace(vertices=_placed(data.vertices, scale, up))
     if up is None and not format.axis:
         _warn_about_axis(path, np.asarray(data.vertices))

@@ -11,12 +11,16 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_folder
+from warpgarment.io.surface.mtl import mtl_text
+from warpgarment.io.surface.obj import OBJ_KEEPS, has_materials, text_around
+from warpgarment.io.surface.record import of_triangles, say_left_out
 
 from .data import Format, MotionData, ReadOptions
-from .obj import chosen_polygons, obj_text, read_polygons
+from .obj import chosen_polygons, obj_text, read_polygons, surface_of
 from .polygons import triangulate_counts
 
-FRAME = "frame_*.obj"
+LIBRARY = "materials.mtl"
+FRAME = ("frame_*.obj", LIBRARY)
 LONGEST = 10_000  # frames that are missing in a row
 
 
@@ -54,9 +58,10 @@ def read_folder(path: Path, options: ReadOptions) -> MotionData:
     except MeshError as error:
         raise MeshError(f"{files[0]}: {error}") from None
     numbers = _numbers(files)
+    surface = surface_of(files[0], first, options.mesh, used)
     step, vertices = _spread(path, numbers, np.stack(frames))
     with np.errstate(over="ignore"):
-        return MotionData(vertices.astype(np.float32), faces, step=step, start=numbers[0] / step)
+        return MotionData(vertices.astype(np.float32), faces, step=step, start=numbers[0] / step, surface=surface)
 
 
 def _numbers(files: list[Path]) -> list[int]:
@@ -100,12 +105,21 @@ def _spread(path: Path, numbers: list[int], frames: np.ndarray) -> tuple[int, np
 
 
 def write_folder(path: Path, data: MotionData) -> None:
-    """Writes frame_0000.obj, frame_0001.obj, ...; a folder that holds nothing else is replaced."""
+    """Writes frame_0000.obj, frame_0001.obj, ..., and materials.mtl where there are materials.
+
+    A folder that holds nothing else is replaced.
+    """
+    say_left_out(path, data.surface, sets=1, keeps=OBJ_KEEPS)
     digits = max(4, len(str(len(data.vertices) - 1)))
+    library = LIBRARY if has_materials(data.surface) else ""
+    around = text_around(data.surface or of_triangles(data.faces), data.name, library)
     with atomic_folder(path, FRAME) as folder:
+        if library and data.surface is not None:
+            (folder / library).write_text(mtl_text(data.surface, path), encoding="utf-8")
         for frame, positions in enumerate(data.vertices):
-            text = obj_text(positions, data.faces, data.name)
-            (folder / f"frame_{frame:0{digits}d}.obj").write_text(text, encoding="utf-8")
+            (folder / f"frame_{frame:0{digits}d}.obj").write_text(
+                obj_text(positions, data.faces, data.name, around), encoding="utf-8"
+            )
 
 
 FORMAT = Format(read_motion=read_folder, write_motion=write_folder, named=True)

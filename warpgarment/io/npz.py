@@ -16,6 +16,8 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.surface.arrays import PREFIX, from_arrays, to_arrays
+from warpgarment.io.surface.record import Surface, worth_keeping
 
 from .data import Format, MeshData, MotionData, ReadOptions
 from .parts import ALL, Parts, named
@@ -102,16 +104,19 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
-    arrays = read_npz(path, ("vertices", "faces"), {"vertices", "faces", "pins", "name"}.__contains__)
+    known = {"vertices", "faces", "pins", "name"}
+    arrays = read_npz(path, ("vertices", "faces"), lambda key: key in known or key.startswith(PREFIX))
     _check_name(path, arrays, options.mesh)
-    return MeshData(arrays["vertices"], arrays["faces"], arrays.get("pins"), _name(arrays))
+    return MeshData(arrays["vertices"], arrays["faces"], arrays.get("pins"), _name(arrays), _surface(path, arrays))
 
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     """Positions, or a rest mesh with bones that move it."""
     known = {"vertices", "collider_faces", *SKINNED}
     arrays = read_npz(
-        path, ("faces",), lambda key: key in known or key == "name" or key.startswith("status_") or _is_rate(key)
+        path,
+        ("faces",),
+        lambda key: key in known or key == "name" or key.startswith(("status_", PREFIX)) or _is_rate(key),
     )
     if "vertices" in arrays:
         vertices = arrays["vertices"]
@@ -128,8 +133,22 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
             raise MeshError(f"{path}: {error}") from None
     _check_name(path, arrays, options.mesh)
     fps = _rate(path, arrays)
-    extra = {key: array for key, array in arrays.items() if key not in known and not _is_rate(key)}
-    return MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
+    others = {key for key in arrays if key in known or _is_rate(key) or key.startswith(PREFIX)}
+    extra = {key: array for key, array in arrays.items() if key not in others}
+    surface = _surface(path, arrays)
+    return MotionData(
+        vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra, surface=surface
+    )
+
+
+def _surface(path: Path, arrays: Mapping[str, np.ndarray]) -> Surface | None:
+    def make() -> Surface | None:
+        found = from_arrays(arrays)
+        if found is not None:
+            found.check_vertices(arrays["vertices"].shape[-2])
+        return found
+
+    return worth_keeping(path, make)
 
 
 def _is_rate(key: str) -> bool:
@@ -161,12 +180,22 @@ def _name(arrays: Mapping[str, np.ndarray]) -> str:
 
 def _write_mesh(path: Path, data: MeshData) -> None:
     pins = {} if data.pins is None or len(data.pins) == 0 else {"pins": data.pins}
-    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **pins})
+    write_npz(
+        path,
+        {
+            "vertices": data.vertices,
+            "faces": data.faces,
+            "name": np.array(data.name),
+            **pins,
+            **to_arrays(data.surface),
+        },
+    )
 
 
 def _write_motion(path: Path, data: MotionData) -> None:
     rate = {} if data.fps is None else {"fps": np.array(data.fps, dtype=np.float64)}
-    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **rate, **data.extra})
+    arrays = {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **rate, **data.extra}
+    write_npz(path, arrays | to_arrays(data.surface))
 
 
 FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True)

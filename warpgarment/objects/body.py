@@ -19,6 +19,7 @@ from warpgarment.geometry.checks import (
     to_numpy,
 )
 from warpgarment.geometry.orientation import turned_outward
+from warpgarment.io.surface.record import Surface
 
 MOST_BETWEEN, LARGEST = 100, 1 << 30  # new frames for each old one, and bytes, that resampling makes at most
 
@@ -34,6 +35,8 @@ class BodyMotion:
         vertices: Positions [m], Y up, float32, shape [T,V,3].
         faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
         fps: Frames per second.
+        surface: Polygons, texture coordinates, materials and groups of the file it was loaded from, for `save`; None:
+            triangles alone. They are lost where faces are left out.
 
     Args:
         vertices: Positions [m], shape [T,V,3]; NumPy, torch or nested lists.
@@ -54,12 +57,16 @@ class BodyMotion:
         if flat.all():
             complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
         self.faces = turned_outward(self.vertices[0], self.faces, "the body")
+        self.surface: Surface | None = None
 
     @classmethod
-    def _derived(cls, vertices: np.ndarray, faces: np.ndarray, fps: float, degenerate_faces: int) -> BodyMotion:
+    def _derived(
+        cls, vertices: np.ndarray, faces: np.ndarray, fps: float, degenerate_faces: int, surface: Surface | None = None
+    ) -> BodyMotion:
         """A motion of vertices and faces that another one has checked and turned outwards."""
         motion = cls.__new__(cls)
         motion.vertices, motion.faces, motion.fps, motion.degenerate_faces = vertices, faces, fps, degenerate_faces
+        motion.surface = surface
         return motion
 
     def __repr__(self) -> str:
@@ -119,12 +126,15 @@ class BodyMotion:
         rate = rate_of(path, data, fps)
         try:
             motion = cls(data.vertices, data.faces, rate)
+            if data.surface is not None:
+                data.surface.check_vertices(motion.vertices.shape[1])
+                motion.surface = data.surface.following(data.faces, motion.faces)
             return motion.submesh(data.collider_faces) if collider and data.collider_faces is not None else motion
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes the motion as .npz, .usd (.usda, .usdc), .pc2 with .obj beside it, or a folder of .obj files.
+        """Writes the motion as .npz, .usd (.usda, .usdc), .glb, .pc2 with .obj beside it, or a folder of .obj files.
 
         The output is written completely or not at all.
 
@@ -134,7 +144,8 @@ class BodyMotion:
         from warpgarment.io.data import MotionData
         from warpgarment.io.files import write_motion
 
-        write_motion(path, MotionData(self.vertices, self.faces, self.fps, name=Path(path).stem or "body"))
+        name = Path(path).stem or "body"
+        write_motion(path, MotionData(self.vertices, self.faces, self.fps, name=name, surface=self.surface))
 
     def resampled(self, fps: float, frames: int | None = None) -> BodyMotion:
         """The motion at another rate, with positions interpolated linearly in time.
@@ -162,7 +173,7 @@ class BodyMotion:
         before = np.minimum(time.astype(np.int64), max(last - 1, 0))
         share = (time - before).astype(np.float32)[:, None, None]
         vertices = self.vertices[before] * (1 - share) + self.vertices[np.minimum(before + 1, last)] * share
-        return self._derived(vertices, self.faces, fps, self.degenerate_faces)
+        return self._derived(vertices, self.faces, fps, self.degenerate_faces, self.surface)
 
     def submesh(self, face_mask: Any) -> BodyMotion:
         """The motion of some faces only, without the vertices that belong to none of them.

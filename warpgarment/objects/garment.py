@@ -22,6 +22,7 @@ from warpgarment.geometry.checks import (
 from warpgarment.geometry.clean import clean_mesh
 from warpgarment.geometry.orientation import agreeing
 from warpgarment.io.disk.cache import remembered
+from warpgarment.io.surface.record import Surface
 
 if TYPE_CHECKING:
     from warpgarment.geometry.pooled_geodesics import PooledGeodesics
@@ -39,6 +40,8 @@ class Garment:
         faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
         pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty if there are none.
         name: Name of the garment, for messages and file names.
+        surface: Polygons, texture coordinates, materials and groups, as the garment's file has them; a rollout hands
+            them on to its result. None: nothing but the triangles.
 
     The cached properties (`edges`, `components`, `face_frames`, `geodesics`, `pooled_geodesics`, `laplacian`) are
     computed from these arrays once: do not change the arrays, make a new garment instead.
@@ -48,6 +51,7 @@ class Garment:
         faces: Vertex indices, integers, shape [F,3].
         pins: Vertices to tie to the body's surface, integers, shape [P]; None for none.
         name: Name of the garment, any text.
+        surface: Polygons that name these vertices, with their looks; None for none.
 
     Raises:
         MeshError: The arrays have other shapes or are empty, or there are numbers that are not finite, indices out of
@@ -56,13 +60,16 @@ class Garment:
             warning), or vertices without a face. The error names the element, the count and the remedy.
     """
 
-    def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = ""):
+    def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", surface: Surface | None = None):
         self.vertices = checked_positions(vertices)
-        self.faces = checked_faces(faces, len(self.vertices), remedy=REMEDY)
-        self.faces = agreeing(self.vertices, self.faces, f"garment {name!r}" if name else "the garment")
+        given = checked_faces(faces, len(self.vertices), remedy=REMEDY)
+        self.faces = agreeing(self.vertices, given, f"garment {name!r}" if name else "the garment")
         check_rest_mesh(self.vertices, self.faces)
         self.pins = checked_pins(pins, len(self.vertices))
         self.name = str(name)
+        self.surface = None if surface is None else surface.following(given, self.faces)
+        if self.surface is not None:
+            self.surface.check_vertices(len(self.vertices))
 
     def __repr__(self) -> str:
         pins = f", {len(self.pins):,} pins" if len(self.pins) else ""
@@ -106,14 +113,16 @@ class Garment:
         data = read_mesh(path, unit=unit, mesh=mesh, up=up)
         try:
             make = cls.cleaned_from if clean else cls
-            return make(data.vertices, data.faces, pins=data.pins, name=data.name or path.stem)
+            name = data.name or path.stem
+            return make(data.vertices, data.faces, pins=data.pins, name=name, surface=data.surface)
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes the garment as .obj, .ply, .npz or .usd (.usda, .usdc), completely or not at all.
+        """Writes the garment as .obj, .ply, .npz, .glb (.gltf) or .usd (.usda, .usdc), completely or not at all.
 
-        Only .npz files keep the pins.
+        Only .npz files keep the pins. Polygons, texture coordinates, materials and groups that were read are written
+        where the format has them; a warning says what is left out. The materials of an .obj lie in a .mtl beside it.
 
         Args:
             path: File to write; its suffix decides the format.
@@ -121,33 +130,39 @@ class Garment:
         from warpgarment.io.data import MeshData
         from warpgarment.io.files import write_mesh
 
-        write_mesh(Path(path), MeshData(self.vertices, self.faces, self.pins, self.name))
+        write_mesh(Path(path), MeshData(self.vertices, self.faces, self.pins, self.name, self.surface))
 
     @classmethod
-    def cleaned_from(cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "") -> Garment:
+    def cleaned_from(
+        cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", surface: Surface | None = None
+    ) -> Garment:
         """A garment from a mesh that the constructor refuses.
 
         Vertices closer than 1e-6 of the bounding box are merged; vertices that are not finite are removed with their
         faces; faces with indices out of range, with a vertex twice or without area, and repeated faces are removed;
         where more than two faces share an edge, the largest two stay; neighbours that disagree on the outside are
-        flipped to agree with the majority; vertices without a face are removed. Pins follow their vertices.
+        flipped to agree with the majority; vertices without a face are removed. Pins and surface follow their vertices.
 
         Args:
             vertices: Rest positions [m], shape [V,3].
             faces: Vertex indices, shape [F,3].
             pins: Vertices to tie to the body's surface, as indices before cleaning, shape [P]; None for none.
             name: Name of the garment, any text.
+            surface: Polygons that name vertices before cleaning; None for none.
 
         Raises:
             MeshError: Nothing is left, or the arrays have another shape.
         """
         new_vertices, new_faces, went = clean_mesh(vertices, faces)
         new_pins = went[checked_pins(pins, len(went))]
-        return cls(new_vertices, new_faces, pins=new_pins[new_pins >= 0], name=name)
+        if surface is not None:
+            surface.check_vertices(len(went))
+            surface = surface.renumbered(went)
+        return cls(new_vertices, new_faces, pins=new_pins[new_pins >= 0], name=name, surface=surface)
 
     def cleaned(self) -> Garment:
         """A cleaned copy: joins vertices at the same place, such as the two sides of a seam. See `cleaned_from`."""
-        return self.cleaned_from(self.vertices, self.faces, pins=self.pins, name=self.name)
+        return self.cleaned_from(self.vertices, self.faces, pins=self.pins, name=self.name, surface=self.surface)
 
     @cached_property
     def edges(self) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
+from warpgarment.io.surface.record import Surface
 
 from .status import RolloutStatus, Verdict
 
@@ -24,6 +25,7 @@ class GarmentMotion:
         fps: Frames per second.
         status: One `RolloutStatus` per frame, or empty if the motion was not simulated.
         name: Name of the garment, for messages and file names.
+        surface: Polygons, texture coordinates, materials and groups of the garment's file, for `save`; None: triangles.
 
     Raises:
         MeshError: Shapes do not fit each other, an index is out of range, or the number of statuses is neither zero
@@ -31,13 +33,23 @@ class GarmentMotion:
     """
 
     def __init__(
-        self, vertices: Any, faces: Any, fps: float = 30.0, status: Sequence[RolloutStatus] = (), name: str = ""
+        self,
+        vertices: Any,
+        faces: Any,
+        fps: float = 30.0,
+        status: Sequence[RolloutStatus] = (),
+        name: str = "",
+        *,
+        surface: Surface | None = None,
     ):
         self.vertices = checked_positions(vertices, frames=True, finite=False)
         self.faces = checked_faces(faces, self.vertices.shape[1])
         self.fps = checked_fps(fps)
         self.status = list(status)
         self.name = str(name)
+        self.surface = surface
+        if surface is not None:
+            surface.check_vertices(self.vertices.shape[1])
         if self.status and len(self.status) != len(self.vertices):
             raise MeshError(f"{len(self.status)} statuses for {len(self.vertices)} frames. Give one a frame, or none.")
 
@@ -58,9 +70,14 @@ class GarmentMotion:
 
         - ``.npz``: positions, faces, rate, status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres;
+        - ``.glb``, ``.gltf``: triangles with a morph target per frame, which an animation shows one after another;
         - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it;
         - no suffix, or a slash at the end: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is
           replaced if it holds nothing else.
+
+        Polygons, texture coordinates, materials (base colour, opacity, name of a picture) and groups that were read
+        with the garment are written too, in the order of its file; materials of OBJ into a .mtl beside it. glTF has
+        triangles alone and neither objects nor groups. A warning says in one line what a format leaves out.
 
         Args:
             path: File or folder to write; parent folders are made.
@@ -75,7 +92,9 @@ class GarmentMotion:
         from warpgarment.io.files import write_motion
 
         name, extra = self.name or "garment", self._status_arrays()
-        write_motion(path, MotionData(self.vertices, self.faces, self.fps, name=name, extra=extra))
+        write_motion(
+            path, MotionData(self.vertices, self.faces, self.fps, name=name, extra=extra, surface=self.surface)
+        )
 
     @classmethod
     def load(
@@ -116,7 +135,7 @@ class GarmentMotion:
                 rows = zip(*columns, verdicts, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
             name = str(data.extra["name"]) if "name" in data.extra else path.stem
-            return cls(data.vertices, data.faces, rate, status, name)
+            return cls(data.vertices, data.faces, rate, status, name, surface=data.surface)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
 

@@ -198,7 +198,8 @@ class Simulator:
                 label = worn.name or f"garment {i}"
                 warnings.warn(f"{label} stopped: {statuses[-1].message}", RuntimeWarning, stacklevel=2)
             moved = recording.positions[i][: len(statuses)]
-            results.append(GarmentMotion(moved, worn.faces, self.network.config.fps, statuses, worn.name))
+            fps, surface = self.network.config.fps, worn.surface
+            results.append(GarmentMotion(moved, worn.faces, fps, statuses, worn.name, surface=surface))
         return results[0] if single else results
 
     @overload
