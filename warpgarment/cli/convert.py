@@ -20,9 +20,10 @@ class Convert:
     """Options of `convert`."""
 
     input: tyro.conf.Positional[Path]
-    """Motion to read: .npz, .usd, .pc2 (with its .obj beside it), or a folder of .obj."""
+    """Motion to read: .npz, .usd, .glb, .pc2 (with its .obj beside it), or a folder of .obj."""
     output: tyro.conf.Positional[Output]
-    """Motion to write: .npz, .usd (.usda, .usdc), .pc2, or a folder of .obj."""
+    """Motion to write: .npz, .usd (.usda, .usdc), .glb, .pc2, or a folder of .obj. Polygons, UVs, materials and groups
+    stay, as far as the format has them."""
     fps: float | None = None
     """Resample to this rate; by default the rate stays."""
     input_fps: float | None = None
@@ -49,5 +50,6 @@ def run(options: Convert) -> None:
         )
     if options.fps is not None:
         motion = motion.resampled(options.fps)
-    motion.save(options.output)
+    with spoken(output="OUTPUT"):
+        motion.save(options.output)
     print(f"{options.output}: {motion.frames} frames at {motion.fps:g} fps, {motion.vertices.shape[1]} vertices")

@@ -25,9 +25,10 @@ class Simulate:
     garment: tyro.conf.Positional[Path]
     """Rest mesh of the garment, draped on the body's first frame (or see --fit-rest): .obj, .ply, .glb, .usd, .npz."""
     body: tyro.conf.Positional[Path]
-    """Body motion: .npz, .usd, .pc2 with its .obj beside it, or a folder of .obj."""
+    """Body motion: .npz, .usd, .glb, .pc2 with its .obj beside it, or a folder of .obj."""
     out: Output
-    """Where to write: .usd, .pc2, .npz, or a folder of .obj (no suffix)."""
+    """Where to write: .usd, .glb, .pc2, .npz, or a folder of .obj (no suffix). Polygons, UVs, materials and groups of
+    the garment's file stay; glTF has triangles only, and normals are left to whoever shows the result."""
     weights: str = "default"
     """Network: a name that ships with the package, or a checkpoint file or folder."""
     device: str | None = None
@@ -74,7 +75,8 @@ def run(options: Simulate) -> None:
         rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
     motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, progress=sys.stderr.isatty())
-    motion.save(options.out)
+    with spoken(out="--out"):
+        motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))
     print(f"\nwrote {options.out}")

@@ -113,17 +113,17 @@ class GarmentMotion:
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that USD files
                 are converted by their own `metersPerUnit` and `upAxis`.
             fps: Overrides the file's rate; 30, with a warning, where neither says, as .pc2 and folders of .obj do not.
-            mesh: See `BodyMotion.load`.
+            mesh: See `BodyMotion.load`; None reads all objects of a folder of OBJ or of a .pc2's mesh as one.
             up: See `BodyMotion.load`.
 
         Raises:
             MeshError: Not such a file.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.files import rate_of, read_motion
+        from warpgarment.io.files import rate_of, read_motion, whole_output
 
         path = Path(path)
-        data = read_motion(path, unit=unit, mesh=mesh, up=up)
+        data = read_motion(path, unit=unit, mesh=whole_output(path, mesh), up=up)
         if path.suffix.lower() == ".npz" and data.fps is None and fps is None:
             raise MeshError(f"{path}: no array named 'fps'; it is not what GarmentMotion.save writes. Give fps=.")
         rate = rate_of(path, data, fps)

@@ -11,11 +11,14 @@ from warpgarment.errors import MeshError
 from warpgarment.io.data import Format, MeshData, MotionData, ReadOptions
 from warpgarment.io.joined import join_exact
 from warpgarment.io.parts import ALL, Parts, connected_pieces, listed, named, unconnected
+from warpgarment.io.surface.record import say_left_out, worth_keeping
 from warpgarment.io.times import frames_of
 
 from .animation import Channels
 from .container import Document
+from .looks import SETS, surface_of
 from .scene import Placed, Scene
+from .writing import write_gltf
 
 LARGEST, RATIO = 256 << 20, 1_000  # bytes of positions from which on a file must have a thousandth of them
 _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, struct.error)
@@ -63,7 +66,7 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
     if mesh not in (None, ALL):
         chosen = named(path, str(mesh), names, Parts([one.mesh for one in placed], np.arange(len(placed))))
         placed = [one for one, wanted in zip(placed, chosen, strict=True) if wanted]
-    vertices, faces, owner = _joined(placed)
+    vertices, faces, owner, split = _joined(placed)
     if mesh is None:
         pieces = connected_pieces(vertices.shape[1], np.full(len(faces), 3), faces.reshape(-1))
         if unconnected(Parts(names.names, owner), pieces):
@@ -73,7 +76,13 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
             )
     name = placed[0].name if len(placed) == 1 else ""
     start = float(codes[0]) * frames.fps if frames.fps else 0.0
-    return MotionData(vertices, faces, frames.fps, name=name, start=start), name
+    surface = worth_keeping(path, lambda: surface_of(path, document, placed, split, faces))
+    return MotionData(vertices, faces, _rate(frames.fps), name=name, start=start, surface=surface), name
+
+
+def _rate(fps: float | None) -> float | None:
+    """A rate without the rounding of times that are float32: whole where it is nearly."""
+    return float(round(fps)) if fps is not None and abs(fps - round(fps)) < 1e-5 * fps else fps
 
 
 def _still(document: Document) -> Document:
@@ -81,8 +90,8 @@ def _still(document: Document) -> Document:
     return document
 
 
-def _joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Meshes as one: positions float32 [T,V,3], faces [F,3], and the mesh of each face [F].
+def _joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Meshes as one: positions float32 [T,V,3], faces [F,3], the mesh of each face [F], and faces before the joining.
 
     Vertices become one where they are at exactly the same place in the first, the middle and the last frame.
     """
@@ -94,17 +103,26 @@ def _joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     faces = np.concatenate([one.faces + base for one, base in zip(placed, bases[:-1], strict=True)])
     owner = np.repeat(np.arange(len(placed)), [len(one.faces) for one in placed])
     places = vertices[[0, count // 2, count - 1]].transpose(1, 0, 2).reshape(vertices.shape[1], -1)
-    kept, faces = join_exact(places, faces)
-    return vertices[:, kept], faces, owner
+    kept, joined = join_exact(places, faces)
+    return vertices[:, kept], joined, owner, faces
 
 
 def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
     found, name = read_gltf(path, mesh=options.mesh, moving=False)
-    return MeshData(found.vertices[0], found.faces, name=name)
+    return MeshData(found.vertices[0], found.faces, name=name, surface=found.surface)
+
+
+def _write_mesh(path: Path, data: MeshData) -> None:
+    _write_motion(path, MotionData(np.asarray(data.vertices)[None], data.faces, name=data.name, surface=data.surface))
 
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     return read_gltf(path, mesh=options.mesh)[0]
 
 
-FORMAT = Format(read_mesh=_read_mesh, read_motion=_read_motion, named=True, axis=True)
+def _write_motion(path: Path, data: MotionData) -> None:
+    say_left_out(path, data.surface, sets=SETS, keeps="materials")
+    write_gltf(path, data)
+
+
+FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True, axis=True)

@@ -34,7 +34,7 @@ def read_libraries(path: Path, names: Iterable[str]) -> dict[str, Material]:
                     with open_plain(library, LARGEST) as file:
                         found = _materials(library, file.read().decode("utf-8-sig", "replace")) | found
                     break
-            except (MeshError, OSError, ValueError):
+            except (MeshError, OSError, ValueError, IndexError):
                 continue
     return found
 
