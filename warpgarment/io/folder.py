@@ -44,7 +44,7 @@ def read_folder(path: Path, options: ReadOptions) -> MotionData:
     used, _, counts, corners = chosen_polygons(files[0], first, options.mesh)
     frames = [first.vertices[used]]
     for file in files[1:]:
-        found = read_polygons(file)
+        found = read_polygons(file, dressed=False)
         same = np.array_equal(found.counts, first.counts) and np.array_equal(found.corners, first.corners)
         if found.vertices.shape != first.vertices.shape or not same:
             raise MeshError(

@@ -129,8 +129,8 @@ def surface_of(path: Path, found: ObjMesh, mesh: str | None, used: np.ndarray) -
     return worth_keeping(path, make)
 
 
-def read_polygons(path: Path) -> ObjMesh:
-    """An OBJ file as it is; raises as `read_obj`."""
+def read_polygons(path: Path, *, dressed: bool = True) -> ObjMesh:
+    """An OBJ file as it is, or without its looks; raises as `read_obj`."""
     vertices: list[list[float]] = []
     counts: list[int] = []
     corners: list[int] = []
@@ -152,12 +152,13 @@ def read_polygons(path: Path) -> ObjMesh:
                 counts.append(len(words) - 1)
                 of_object.append(name)
                 of_group.append(group)
-                looks.face(words[1:])
+                if dressed:
+                    looks.face(words[1:])
             elif words[0] == "o":
                 name = objects.setdefault(" ".join(words[1:]), len(objects))
             elif words[0] == "g":
                 group = groups.setdefault(" ".join(words[1:]), len(groups))
-            else:
+            elif dressed:
                 looks.line(number, line)
         except ValueError as error:
             raise MeshError(f"{path}, line {number}: {error}. The file is damaged or cut short.") from None

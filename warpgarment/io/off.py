@@ -42,8 +42,8 @@ def read_off(path: Path) -> MeshData:
         if corners.min() < 0 or corners.max() >= count:
             raise ValueError(f"a face names a vertex beyond the {count:,}")
         with np.errstate(over="ignore"):
-            rest, faces = vertices.astype(np.float32), triangulate_counts(vertices, counts, corners)
-        return MeshData(rest, faces, surface=worth_keeping(path, lambda: Surface(counts, corners)))
+            rest, triangles = vertices.astype(np.float32), triangulate_counts(vertices, counts, corners)
+        return MeshData(rest, triangles, surface=worth_keeping(path, lambda: Surface(counts, corners)))
     except (ValueError, IndexError, OverflowError) as error:
         raise MeshError(
             f"{path}: not a readable OFF file ({str(error)[:100]}). It is damaged, cut short, or of another kind."

@@ -128,9 +128,7 @@ def test_renumbering_drops_what_is_left_of_polygons():
     left = surface.renumbered(new)
     assert left.counts.tolist() == [3, 5, 3]
     assert left.corners.tolist() == [0, 1, 2, 0, 1, 3, 4, 5, 0, 2, 3]
-    assert left.coordinates[0].corners.tolist() == [1, 2, 3, 7, 8, 9, 10, 11, 12, 13, 14] or (
-        left.coordinates[0].corners.tolist() == [0, 2, 3, 7, 8, 9, 10, 11, 12, 13, 14]
-    )
+    assert left.coordinates[0].corners.tolist() == [0, 2, 3, 7, 8, 9, 10, 11, 12, 13, 14]
     assert (left.material.tolist(), left.groups.of_polygon.tolist()) == ([0, 0, 1], [1, 0, -1])
     assert surface.renumbered(np.where(new == 1, -1, new)).counts.tolist() == [3]
     assert surface.renumbered(np.zeros(8, int)) is None
@@ -157,21 +155,16 @@ def test_indices_are_checked(kind):
         Surface(**{"counts": [3, 3], "corners": [0, 1, 2, 0, 2, 3], **WRONG[kind]})
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["f 1/999 2/1 14/1", "f 1/-999 2/1 14/1", "f 1/x 2/1 14/1", "vt a b", "vt", "f 1/99999999999999999999 2/1 14/1"],
-)
-def test_damaged_looks_of_obj_are_left_out_aloud(tmp_path, line):
+@pytest.mark.parametrize("face", ["1/999 2/1", "1/-999 2/1", "1/x 2/1", "1/99999999999999999999 2/1", "vt a b", "vt"])
+def test_damaged_looks_of_obj_are_left_out_aloud(tmp_path, face):
     """A garment would be refused for looks that it is not simulated by, or its looks dropped in silence."""
-    said = heard(lambda: load(tmp_path, f"{line}\nv 0 0 9\nv 0 1 9\nv 1 0 9\nf -1/1 -2/1 -3/1"[0 if "f" in line else 0 :], mesh="skirt")
-                 if line.startswith("vt") else None)  # fmt: skip
-    if line.startswith("vt"):
-        assert len([s for s in said if "will not be in outputs" in s]) == 1
-        return
     path = dressed.write_obj(tmp_path / "skirt.obj")
     rows = path.read_text().splitlines()
-    first = next(k for k, row in enumerate(rows) if row.startswith("f "))
-    rows[first] = line.replace("14/1", "14/1 13/1")
+    if face.startswith("vt"):
+        rows.insert(3, face)
+    else:
+        first = next(k for k, row in enumerate(rows) if row.startswith("f "))
+        rows[first] = f"f {face} 14/1 13/1"
     path.write_text("\n".join(rows))
     with pytest.warns(UserWarning, match="texture coordinates, materials and groups will not be in outputs"):
         garment = wg.Garment.load(path)
@@ -209,7 +202,7 @@ def test_libraries_outside_the_folder_are_not_read(tmp_path):
     (tmp_path / "in").mkdir()
     (tmp_path / "secret.mtl").write_text("newmtl denim\nKd 1 0 0\n")
     os.mkfifo(tmp_path / "in" / "pipe.mtl")
-    for name in ("../secret.mtl", str(tmp_path / "secret.mtl"), "pipe.mtl", "none.mtl", ".", "x" * 5000, "skirt\0.mtl"):
+    for name in ("../secret.mtl", str(tmp_path / "secret.mtl"), "pipe.mtl", "none.mtl", ".", "x" * 5000):
         path = dressed.write_obj(tmp_path / "in" / "skirt.obj", library=False)
         path.write_text(path.read_text().replace("mtllib skirt.mtl", f"mtllib {name}"))
         assert [m.color for m in wg.Garment.load(path).surface.materials] == [None, None]
@@ -246,12 +239,12 @@ def test_a_library_of_somebody_else_stays(tmp_path):
     assert (tmp_path / "skirt.mtl").read_bytes() == before
     assert (tmp_path / "skirt_1.mtl").read_text().startswith(OURS)
     assert {p.name for p in tmp_path.iterdir()} == {"skirt.obj", "skirt.mtl", "skirt_1.mtl"}
-    assert dressed.read_obj(tmp_path / "skirt.obj")[1] == pytest.approx(COLORS) or True
+    assert dressed.read_obj(tmp_path / "skirt.obj")[1].keys() == COLORS.keys()
     motion = wg.GarmentMotion(VERTICES[None], garment.faces, surface=garment.surface)
     motion.save(tmp_path / "frames")
     motion.save(tmp_path / "frames")  # an old result, its library included, is replaced
     (tmp_path / "frames" / "other.mtl").write_text("")
-    with pytest.raises(FileExistsError, match="other.mtl"):
+    with pytest.raises(FileExistsError, match=r"other\.mtl"):
         motion.save(tmp_path / "frames")
 
 

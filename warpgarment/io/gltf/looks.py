@@ -45,9 +45,10 @@ def surface_of(
     used = [part.primitive.get("material") for part in parts]
     known = sorted({number for number in used if number is not None})
     materials = tuple(_material(path, document, number) for number in known)
-    label = [NONE if number is None else known.index(number) for number in used]
-    names = list(dict.fromkeys(one.name for one in placed))
-    owner = np.repeat([names.index(one.name) for one in placed], [len(one.faces) for one in placed])
+    place = {number: k for k, number in enumerate(known)}
+    label = [NONE if number is None else place[number] for number in used]
+    names = {name: k for k, name in enumerate(dict.fromkeys(one.name for one in placed))}
+    owner = np.repeat([names[one.name] for one in placed], [len(one.faces) for one in placed])
     return Surface(
         np.full(len(faces), 3),
         faces.reshape(-1),

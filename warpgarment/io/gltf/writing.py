@@ -22,7 +22,7 @@ from warpgarment.errors import MeshError, OutputError
 from warpgarment.io.data import MotionData
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.surface.mtl import named_from
-from warpgarment.io.surface.record import NONE, Material, Surface, of_triangles
+from warpgarment.io.surface.record import NONE, Material, Surface, members, of_triangles
 
 FLOAT, INDEX = 5126, 5125
 LARGEST = 2**32 - 1  # bytes of a .glb
@@ -118,8 +118,8 @@ def _primitives(buffer: _Buffer, vertices: np.ndarray, faces: np.ndarray, surfac
     corners = surface.triangles(vertices[0], faces)
     material = surface.material[surface.polygon_of_corner[corners[:, 0]]]
     found = []
-    for number in np.unique(material).tolist():
-        chosen = corners[material == number].reshape(-1)
+    for number, some in members(material).items():
+        chosen = corners[some].reshape(-1)
         columns = [surface.corners[chosen], *(one.corners[chosen] for one in surface.coordinates)]
         rows, index = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
         positions = vertices[:, rows[:, 0]]
@@ -157,7 +157,8 @@ def _materials(surface: Surface, folder: Path) -> dict[str, Any]:
     """Materials with their pictures; nothing where there are none."""
     if not surface.materials:
         return {}
-    pictures = list(dict.fromkeys(material.texture for material in surface.materials if material.texture))
+    named = dict.fromkeys(material.texture for material in surface.materials if material.texture)
+    pictures = {name: k for k, name in enumerate(named) if name}
     found: dict[str, Any] = {"materials": [_material(material, pictures) for material in surface.materials]}
     if pictures:
         found["images"] = [{"uri": quote(named_from(folder, picture), safe="/:")} for picture in pictures]
@@ -165,13 +166,13 @@ def _materials(surface: Surface, folder: Path) -> dict[str, Any]:
     return found
 
 
-def _material(material: Material, pictures: list[str]) -> dict[str, Any]:
+def _material(material: Material, pictures: dict[str, int]) -> dict[str, Any]:
     look: dict[str, Any] = {"metallicFactor": 0.0}
     if material.color is not None or material.opacity is not None:
         color = [*(material.color or (1.0, 1.0, 1.0)), 1.0 if material.opacity is None else material.opacity]
         look["baseColorFactor"] = np.nan_to_num(np.clip(color, 0.0, 1.0)).tolist()
     if material.texture:
-        look["baseColorTexture"] = {"index": pictures.index(material.texture)}
+        look["baseColorTexture"] = {"index": pictures[material.texture]}
     found = {"name": material.name, "pbrMetallicRoughness": look, "doubleSided": True}
     return found | ({"alphaMode": "BLEND"} if material.opacity is not None and material.opacity < 1.0 else {})
 

@@ -11,7 +11,7 @@ from warpgarment.io.disk.plain import below, open_plain
 
 from .record import Material, Surface, clean_name, unique_names
 
-LARGEST = 16 << 20  # bytes
+LARGEST, MOST = 16 << 20, 16  # bytes of a library, and how many a file may have
 OURS = "# materials of a warpgarment output"  # first line; a file that lacks it is somebody's, and stays
 OPTIONS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}  # numbers after options of a picture; after others comes one word
 
@@ -26,8 +26,8 @@ def read_libraries(path: Path, names: Iterable[str]) -> dict[str, Material]:
         names: The rests of its `mtllib` lines: names of files, with spaces in them or between them.
     """
     found: dict[str, Material] = {}
-    for line in dict.fromkeys(names):
-        for name in dict.fromkeys([line, *line.split()]):
+    for line in list(dict.fromkeys(names))[:MOST]:
+        for name in dict.fromkeys([line, *line.split()[:MOST]]):
             try:
                 library = below(path.parent, name.replace("\\", "/"), "mtllib")
                 if library.is_file():

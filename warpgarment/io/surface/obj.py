@@ -35,7 +35,7 @@ class Looks:
 
     def line(self, number: int, line: str) -> None:
         """A line that is neither a vertex nor a face."""
-        key, _, rest = line.partition(" ") if " " in line else line.partition("\t")
+        key, rest = (*line.split(None, 1), "")[:2]
         if key == "vt":
             try:
                 words = rest.split()

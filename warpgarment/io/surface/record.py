@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,9 +93,9 @@ class Surface:
     corners: np.ndarray
     coordinates: tuple[Coordinates, ...] = ()
     materials: tuple[Material, ...] = ()
-    material: np.ndarray = field(default=None)  # type: ignore[assignment]  # an array in every instance
-    objects: Labels = field(default=None)  # type: ignore[assignment]
-    groups: Labels = field(default=None)  # type: ignore[assignment]
+    material: np.ndarray = None  # type: ignore[assignment]  # an array in every instance
+    objects: Labels = None  # type: ignore[assignment]
+    groups: Labels = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         def put(name: str, value: object) -> None:
@@ -260,6 +260,13 @@ def worth_keeping(where: object, make: Callable[[], Surface | None]) -> Surface 
         )
         return None
     return None if found is None or found.says_nothing else found
+
+
+def members(label: np.ndarray) -> dict[int, np.ndarray]:
+    """For each label that occurs in [N], -1 included, where it does, in order."""
+    order = np.argsort(label, kind="stable")
+    found, starts = np.unique(label[order], return_index=True)
+    return dict(zip(found.tolist(), np.split(order, starts[1:]), strict=True))
 
 
 def say_left_out(path: object, surface: Surface | None, *, sets: int = 0, polygons: str = "", keeps: str = "") -> None:

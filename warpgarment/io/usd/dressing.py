@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.io.surface.mtl import named_from
-from warpgarment.io.surface.record import NONE, Coordinates, Labels, Material, Surface
+from warpgarment.io.surface.record import NONE, Coordinates, Labels, Material, Surface, members
 
 from .looks import OBJECTS
 
@@ -82,23 +82,23 @@ def _subset(mesh: Any, name: str, family: str, polygons: np.ndarray, taken: set[
 
 def _subsets(mesh: Any, labels: Labels, family: str, taken: set[str], *, words: bool) -> None:
     """A subset for each name, with `words` for each word of the names."""
-    order = np.argsort(labels.of_polygon, kind="stable")
-    starts = np.searchsorted(labels.of_polygon[order], np.arange(len(labels.names) + 1))
-    entries = sum(len(labels.names[k].split()) * (starts[k + 1] - starts[k]) for k in labels.used)
-    words = words and entries <= MOST * len(order)
-    members: dict[str, list[np.ndarray]] = {}
+    polygons = members(labels.of_polygon)
+    entries = sum(len(labels.names[k].split()) * len(polygons[k]) for k in labels.used)
+    words = words and entries <= MOST * len(labels.of_polygon)
+    parts: dict[str, list[np.ndarray]] = {}
     for k in labels.used:
         for name in dict.fromkeys(labels.names[k].split() if words else [labels.names[k]]):
-            members.setdefault(name, []).append(order[starts[k] : starts[k + 1]])
-    for name, polygons in members.items():
-        _subset(mesh, name, family, np.sort(np.concatenate(polygons)), taken)
+            parts.setdefault(name, []).append(polygons[k])
+    for name, some in parts.items():
+        _subset(mesh, name, family, np.sort(np.concatenate(some)), taken)
 
 
 def _bind(mesh: Any, surface: Surface, made: list[Any], taken: set[str]) -> None:
     """Binds materials, to the mesh where all faces have one, otherwise to subsets; and their colours for display."""
     from pxr import UsdGeom, UsdShade, Vt
 
-    used = [int(k) for k in np.unique(surface.material)]
+    polygons = members(surface.material)
+    used = list(polygons)
     if used == [NONE]:
         return
     if len(used) == 1:
@@ -111,7 +111,7 @@ def _bind(mesh: Any, surface: Surface, made: list[Any], taken: set[str]) -> None
             if k == NONE:
                 continue
             name = surface.materials[k].name or "material"
-            subset = _subset(mesh, name, "materialBind", np.flatnonzero(surface.material == k), taken)
+            subset = _subset(mesh, name, "materialBind", polygons[k], taken)
             UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(made[k])
     colors = [GREY if k == NONE else surface.materials[k].color or GREY for k in used]
     if all(k == NONE or surface.materials[k].color is None for k in used):
