@@ -19,7 +19,7 @@ from warpgarment.io.polygons import triangulate_counts
 
 NONE = -1  # label of a polygon without one; texture coordinate of a corner without one
 LONGEST = 200  # characters of a name that are kept
-_WRONG = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError)
+_WRONG = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RuntimeError)  # USD has the last
 
 
 class Coordinates(NamedTuple):
