@@ -48,6 +48,8 @@ class BodyMotion:
             indices out of range, no face with an area, or a rate that is not positive.
     """
 
+    surface: Surface | None = None
+
     def __init__(self, vertices: Any, faces: Any, fps: float = 30.0):
         self.vertices = checked_positions(vertices, frames=True)
         self.faces = checked_faces(faces, self.vertices.shape[1])
@@ -57,7 +59,6 @@ class BodyMotion:
         if flat.all():
             complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
         self.faces = turned_outward(self.vertices[0], self.faces, "the body")
-        self.surface: Surface | None = None
 
     @classmethod
     def _derived(

@@ -60,6 +60,8 @@ class Garment:
             warning), or vertices without a face. The error names the element, the count and the remedy.
     """
 
+    surface: Surface | None = None
+
     def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", surface: Surface | None = None):
         self.vertices = checked_positions(vertices)
         given = checked_faces(faces, len(self.vertices), remedy=REMEDY)

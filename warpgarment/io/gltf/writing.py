@@ -86,7 +86,8 @@ def write_gltf(path: Path, data: MotionData) -> None:
     }
     if len(vertices) > 1:
         mesh["extras"] = {"targetNames": [f"frame_{k:04d}" for k in range(1, len(vertices))]}
-        document["animations"] = [_animation(buffer, len(vertices), 30.0 if data.fps is None else data.fps, data.start)]
+        fps, start = 30.0 if data.fps is None else data.fps, data.start or 0.0
+        document["animations"] = [_animation(buffer, len(vertices), fps, start)]
     document |= _materials(surface, path.parent)
     document |= {
         "accessors": buffer.accessors,
