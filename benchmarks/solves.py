@@ -80,7 +80,7 @@ def collisions(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds
     rest, triangles = tensor(garment.vertices, device), tensor(garment.faces, device, np.int32)
     pressed, refiner = tensor(scene.pressed, device), CollisionSolver(rest, triangles)
     query = bodies.query(pressed, within=EPSILON)
-    closest, normal = contacts(pressed, query.distance, query.face, bodies, EPSILON)
+    normal, closest, *_ = contacts(pressed, query.distance, query.face, bodies, EPSILON)
     limit = torch.full((refiner.component_count,), TOLERANCE, dtype=torch.float64, device=device)
 
     def solve() -> torch.Tensor:

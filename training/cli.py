@@ -88,6 +88,9 @@ _UNUSED = {"cloth3d": ("rest", "unit", "body_unit"), "vto": ("fps", "unit", "bod
 def _import(options: Import) -> None:
     from .readers import detect, read_recording, write_as_sequence
 
+    if options.out.exists():
+        raise FileExistsError(f"{options.out} exists. Remove it, or choose another folder.")
+    check_writable(options.out, folder=True)
     kind = detect(options.source)
     names = ("body", "rest", "fps", "unit", "body_unit")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}

@@ -27,6 +27,7 @@ import torch
 from scipy.spatial import cKDTree
 from trimesh.triangles import closest_point, points_to_barycentric
 
+from warpgarment.errors import MeshError
 from warpgarment.kernels.deformation.gradients import deformation_gradient
 from warpgarment.kernels.deformation.svd import rotation
 from warpgarment.kernels.mesh.laplacian import components
@@ -56,6 +57,23 @@ class RecordedOnBody(Recorded, Protocol):
         """The collider."""
 
 
+def check_rate(recorded: float, network: float) -> None:
+    """Refuses recordings whose frames are at other moments than those that a network predicts.
+
+    Args:
+        recorded: Frames per second of the recording.
+        network: Frames per second of the network.
+
+    Raises:
+        MeshError: They differ.
+    """
+    if abs(recorded - network) > 1e-6 * network:
+        raise MeshError(
+            f"the recording runs at {recorded:g} frames a second and the network at {network:g}: bring it to that rate "
+            "with Recording.resampled before it is written as a sequence."
+        )
+
+
 def predict(
     simulator: Simulator,
     sequence: Recorded,
@@ -77,6 +95,9 @@ def predict(
 
     Returns:
         Vertices of frames newest+1 .. newest+steps [m], float32 [steps,V,3]; NaN after a rollout that failed.
+
+    Raises:
+        MeshError: The sequence has another rate than the network, so that its frames are at other moments.
     """
     history = simulator.network.config.history
     body = cast(RecordedOnBody, sequence).body() if body is None else body
@@ -89,6 +110,7 @@ def predict(
         known = np.array(sequence.vertices[first : newest + 1], np.float32)
     else:
         raise ValueError(f"a warm start needs {history} recorded frames; up to frame {newest} there are {newest + 1}")
+    check_rate(body.fps, simulator.network.config.fps)
     part = BodyMotion(body.vertices[first : newest + steps + 1], body.faces, body.fps)
     with warnings.catch_warnings():  # a rollout that fails is visible in the figures
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.io.disk.outputs import check_writable
+from warpgarment.io.npz import read_npz
 from warpgarment.io.usd import write_usd
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
@@ -76,12 +77,9 @@ def assets(folder: str | Path | None = None) -> DemoAssets:
     garments = {}
     for name in GARMENTS:
         path = folder / f"{name}.npz"
-        with np.load(path, allow_pickle=False) as arrays:
-            missing = {"rest_vertices", "faces", "pins", "truth"} - set(arrays)
-            if missing:
-                raise MeshError(f"{path}: {sorted(missing)[0]!r} is missing; the demo's garments need it")
-            garment = Garment(arrays["rest_vertices"], arrays["faces"], pins=arrays["pins"], name=name)
-            truth = GarmentMotion(arrays["truth"].astype(np.float32), garment.faces, body.fps, name=name)
+        arrays = read_npz(path, ("rest_vertices", "faces", "pins", "truth"))
+        garment = Garment(arrays["rest_vertices"], arrays["faces"], pins=arrays["pins"], name=name)
+        truth = GarmentMotion(arrays["truth"].astype(np.float32), garment.faces, body.fps, name=name, start=body.start)
         if truth.frames > body.frames:
             raise MeshError(f"{path}: {truth.frames} frames of ground truth, the body has {body.frames}")
         garments[name] = DemoGarment(garment, truth)
@@ -134,16 +132,21 @@ def run(
         simulator.timings.clear()
         count = min(frames or item.truth.frames, item.truth.frames)
         motions[name] = motion = simulator.rollout(
-            item.garment, bundle.collider, first_vertices=first, frames=count, face_splits=splits, progress=progress
+            item.garment,
+            bundle.collider,
+            first_vertices=first,
+            frames=count,
+            out_fps="body",
+            face_splits=splits,
+            progress=progress,
         )
         timings[name] = dict(simulator.timings)
         finite = int(np.isfinite(motion.vertices).all((1, 2)).sum())
         errors[name] = float(metrics.mean_vertex_error(motion.vertices[:finite], item.truth.vertices[:finite]))
     for name, motion in motions.items():
         body = _until(bundle.body, motion.frames)
-        write_usd(
-            out / f"{name}.usd", [(name, motion.vertices, motion.faces), ("body", body.vertices, body.faces)], body.fps
-        )
+        meshes = [(name, motion.vertices, motion.faces), ("body", body.vertices, body.faces)]
+        write_usd(out / f"{name}.usd", meshes, body.fps, start=body.clock.number)
         motion.save(out / f"{name}.pc2")
     body = _until(bundle.body, min(motion.frames for motion in motions.values()))
     truth = [bundle.garments[name].truth for name in motions]
@@ -160,7 +163,7 @@ def run(
 
 
 def _until(body: BodyMotion, frames: int) -> BodyMotion:
-    return BodyMotion(body.vertices[:frames], body.faces, body.fps)
+    return BodyMotion(body.vertices[:frames], body.faces, body.fps, start=body.start)
 
 
 def _film(

@@ -1,4 +1,4 @@
-"""Collision refinement: vertices that are too close to something are moved away, and the cloth around them follows."""
+"""Collision refinement: moves vertices away from a surface to which they are too close, and the cloth around them."""
 
 from .body_contacts import BodyContacts, contacts
 from .contact_set import ContactFrame, Contacts, ContactSource

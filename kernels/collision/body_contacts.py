@@ -1,13 +1,15 @@
 """The contacts of a garment with a body: closest points and outward directions in float64. Symbols: solver.py.
 
-The nearest way out of a limb is the wrong one for a vertex that is past its middle: it leads through the limb. Where it
-is known from where a vertex comes, the way from there to the vertex is followed to the first face, and if the nearest
-surface looks the other way than that face, the contact is with that face.
+For a vertex that is past the middle of a limb, the nearest point of the surface is on the wrong side. If the origin of
+a vertex is known, the segment from the origin to the vertex is followed to the first face of the body. If that face
+and the nearest surface have opposite directions, the contact is with that face.
+
+Parts of a body may overlap or leave little room between them. A contact whose direction leads into another part is
+replaced by one that leads out of both (way_out.py). Where another part is opposite the surface, closer than twice the
+distance to keep, half of the room is kept, so that cloth stays between the two.
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 import warp as wp
@@ -19,14 +21,18 @@ from warpgarment.kernels.sdf.closest import Bodies
 from warpgarment.kernels.sdf.nearest_face import closest_on_triangle
 
 from .contact_set import ContactFrame, Contacts
+from .way_out import leads_out, way_out
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
-"""Below this distance [m] the direction from the closest point is noise, and the face's normal is taken."""
+"""Below this distance [m] the direction from the closest point is noise, and the normal of the face is used."""
+
+BEYOND = wp.constant(wp.float64(1e-4))
+"""Distance from the surface [m] at which a way has to be outside."""
 
 
 @wp.func
 def entered(bodies: Bodies, b: int, origin: wp.vec3, end: wp.vec3) -> int:
-    """The face through which a way goes into a body, packed; -1 if it meets none first or comes out of one."""
+    """Packed index of the face by which a segment enters a body; -1 if its first hit is an exit, or there is none."""
     way = end - origin
     length = wp.length(way)
     if b < 0 or b >= bodies.meshes.shape[0] or not (length > 0.0 and wp.isfinite(length)):
@@ -35,6 +41,17 @@ def entered(bodies: Bodies, b: int, origin: wp.vec3, end: wp.vec3) -> int:
     if not hit.result or wp.dot(hit.normal, way) >= 0.0:
         return -1
     return hit.face + bodies.face_offsets[b]
+
+
+@wp.func
+def half_of_the_room(mesh: wp.uint64, point: wp.vec3, outward: wp.vec3, distance: float) -> float:
+    """Half of the way from a surface to what is opposite [m]; infinite where that is further than twice a distance."""
+    start = wp.float32(BEYOND)
+    hit = wp.mesh_query_ray(mesh, point + start * outward, outward, 2.0 * distance)
+    half = wp.float32(wp.inf)
+    if hit.result and wp.dot(hit.normal, outward) < 0.0:
+        half = 0.5 * (start + hit.t)
+    return half
 
 
 @wp.kernel(enable_backward=False)
@@ -46,26 +63,29 @@ def find_contacts(
     distance: wp.array[wp.float32],
     face: wp.array[wp.int32],
     body_of_vertex: wp.array[wp.int32],
-    origin: wp.array[wp.vec3],  # or nothing
-    epsilon: wp.float64,
+    origin: wp.array[wp.vec3],  # may be empty
+    epsilon: wp.array[wp.float32],  # of each vertex, or of all
     # Out:
     closest: wp.array[wp.vec3d],
     normal: wp.array[wp.vec3d],
+    kept: wp.array[wp.float32],
 ):
     """Closest points and outward directions at the vertices closer than epsilon, zero elsewhere.
 
-    The closest point is computed again in float64: of a direction over 0.1 mm, float32 leaves three digits.
+    The closest point is computed again in float64: in float32, a direction over 0.1 mm has three digits.
     """
     i = wp.tid()
     n = wp.vec3d()
     u = wp.vec3d()
-    if wp.float64(distance[i]) < epsilon:
+    keep = epsilon[wp.min(i, epsilon.shape[0] - 1)]
+    if distance[i] < keep:
         p = wp.vec3d(vertices[i])
         corner = bodies.faces[face[i]]
         a = wp.vec3d(bodies.vertices[corner[0]])
         b = wp.vec3d(bodies.vertices[corner[1]])
         c = wp.vec3d(bodies.vertices[corner[2]])
         u = closest_on_triangle(p, a, b, c)
+        edge = b - a
         length = wp.length(p - u)
         if length > AT_SURFACE:
             n = (p - u) / length
@@ -78,14 +98,25 @@ def find_contacts(
             if entry >= 0:
                 corner = bodies.faces[entry]
                 a = wp.vec3d(bodies.vertices[corner[0]])
-                outward = wp.normalize(
-                    wp.cross(wp.vec3d(bodies.vertices[corner[1]]) - a, wp.vec3d(bodies.vertices[corner[2]]) - a)
-                )
+                first = wp.vec3d(bodies.vertices[corner[1]]) - a
+                outward = wp.normalize(wp.cross(first, wp.vec3d(bodies.vertices[corner[2]]) - a))
                 if wp.dot(outward, n) < wp.float64(0.0):
-                    u = p - wp.dot(outward, p - a) * outward  # any point of its plane does
+                    edge = first
+                    u = p - wp.dot(outward, p - a) * outward  # as good as any point of its plane
                     n = outward
+        if distance[i] < 0.0:
+            mesh = bodies.meshes[body_of_vertex[i]]
+            if not leads_out(mesh, wp.vec3(u + BEYOND * n), wp.vec3(n)):
+                way, far = way_out(mesh, vertices[i], wp.vec3(n), wp.vec3(edge))
+                if far >= 0.0:
+                    n = wp.vec3d(way)
+                    u = p + wp.float64(far) * n
+        keep = wp.min(keep, half_of_the_room(bodies.meshes[body_of_vertex[i]], wp.vec3(u), wp.vec3(n), keep))
+        if not wp.dot(n, p - u) < wp.float64(keep):
+            n = wp.vec3d()
     closest[i] = u
     normal[i] = n
+    kept[i] = keep
 
 
 def contacts(
@@ -93,32 +124,37 @@ def contacts(
     distance: torch.Tensor,
     face: torch.Tensor,
     bodies: BodyMeshes,
-    epsilon: float,
+    epsilon: torch.Tensor | float,
     *,
     body_of_vertex: torch.Tensor | None = None,
     origin: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The set C: what a body query found closer than epsilon.
+) -> Contacts:
+    """The set C: contacts of the vertices that are closer to a body than epsilon.
 
     Args:
         vertices: Positions [m], float32 [V,3].
         distance: Signed distance [m], float32 [V], negative inside.
         face: Nearest body face, int32 [V].
         bodies: The bodies in the frame of `vertices`.
-        epsilon: Distance kept from the body [m].
-        body_of_vertex: Body of each vertex, int32 [V]; None where there is one body.
-        origin: Where each vertex comes from [m], float32 [V,3], outside the body or NaN: vertices inside are led back
-            to the side where they went in. None: they leave by the nearest way.
+        epsilon: Distance to keep from the body [m], a number or float32 [V].
+        body_of_vertex: Body of each vertex, int32 [V]; None if there is one body.
+        origin: Origin of each vertex [m], float32 [V,3], outside the body or NaN: vertices inside are moved to the side
+            on which they entered. None moves them to the nearest point of the surface.
 
     Returns:
-        Closest points of the surface or, for vertices that are led back, of the plane of the face where they went in,
-        [m], and outward directions, float64 [V,3]; zero at vertices that are not in C.
+        Contacts without stencils, [V]; normals are zero at vertices that are not in C. Anchors are on the surface, or,
+        for vertices moved to the side on which they entered, on the plane of the face of entry. Distances are epsilon,
+        or half of the room between two parts of the body if that is less.
     """
     vertices = vertices.detach().contiguous()
+    device = vertices.device
     body_of_vertex = bodies.body_of("body_of_vertex", body_of_vertex, len(vertices))
     origin = vertices.new_empty((0, 3)) if origin is None else origin.detach().contiguous()
-    closest, normal = allocate((2, len(vertices), 3), torch.float64, vertices.device)
-    with torch_stream(vertices.device) as device:
+    if not isinstance(epsilon, torch.Tensor):
+        epsilon = torch.full((1,), epsilon, dtype=torch.float32, device=device)
+    closest, normal = allocate((2, len(vertices), 3), torch.float64, device)
+    kept = allocate((len(vertices),), torch.float32, device)
+    with torch_stream(device) as warp_device:
         wp.launch(
             find_contacts,
             dim=len(vertices),
@@ -129,17 +165,18 @@ def contacts(
                 as_argument(face, wp.int32),
                 as_argument(body_of_vertex, wp.int32),
                 as_argument(origin, wp.vec3),
-                float(epsilon),
+                as_argument(epsilon, wp.float32),
                 as_argument(closest, wp.vec3d),
                 as_argument(normal, wp.vec3d),
+                as_argument(kept, wp.float32),
             ],
-            device=device,
+            device=warp_device,
         )
-    return closest, normal
+    return Contacts(normal, closest, kept)
 
 
 class BodyContacts:
-    """The contacts of garments with the bodies that they are on."""
+    """Source of the contacts of garments with their bodies."""
 
     name = "body"
 
@@ -148,22 +185,11 @@ class BodyContacts:
 
         Args:
             vertices: Positions [m], float32 [V,3].
-            frame: The bodies, who is on which, the distance to keep and where the vertices come from.
+            frame: Bodies, body of each vertex, distance to keep, and origins of the vertices.
 
         Returns:
-            Contacts without stencils, [V].
+            V contacts without stencils.
         """
         bodies, on_body, _, epsilon, origin = frame
         query = bodies.query(vertices.detach(), on_body, within=epsilon)
-        closest, normal = contacts(
-            vertices,
-            query.distance,
-            query.face,
-            bodies,
-            math.inf if isinstance(epsilon, torch.Tensor) else epsilon,
-            body_of_vertex=on_body,
-            origin=origin,
-        )
-        if isinstance(epsilon, torch.Tensor):
-            normal = torch.where((query.distance < epsilon)[:, None], normal, 0.0)
-        return Contacts(normal, closest, epsilon)
+        return contacts(vertices, query.distance, query.face, bodies, epsilon, body_of_vertex=on_body, origin=origin)

@@ -1,25 +1,26 @@
-"""Contact forces on a garment whose compliance matrix is known: the small side of the collision refinement.
+"""Compliance matrices of a batch, for a collision refinement with one unknown per contact.
 
-Supplement section 2 asks for (B ⊗ I₃ + N Nᵀ) D = N c, with one column of N, holding n_i, per contact. B is constant per
-garment; with its inverse Z, the compliance, the unknowns shrink from three per vertex to one per contact,
+Supplement section 2 solves (B ⊗ I₃ + N Nᵀ) D = N c, where N has one column with n_i for each contact. B is constant for
+a garment. With its inverse Z, the compliance, there is one unknown per contact instead of three per vertex,
 
     (I + S) y = c,    S_ij = n_i·n_j Z_ij,    D = Z N y
 
-(push-through identity), where y_i = c_i - n_i·D_i is the force of contact i. Conjugate gradients solve it in tens of
-steps where the system for D takes hundreds; a diagonal preconditioner does not pay, for S_ii hardly varies. All
-eigenvalues of I + S are at least 1, so that the residual bounds the error, in y and in D:
+(push-through identity), where y_i = c_i - n_i·D_i is the force of contact i. Conjugate gradients need tens of steps for
+this system and hundreds for that of D. A diagonal preconditioner does not help, since S_ii hardly varies. All
+eigenvalues of I + S are at least 1, so the residual bounds the error, in y and in D:
 
     |δD|_B² = δyᵀ S δy ≤ δyᵀ (I + S) δy ≤ |c - (I + S) y|²
 
-Z is dense, so this is for components of moderate size: forces_inverse_gpu.py on a GPU, forces_inverse_cpu.py on a CPU.
+Z is dense, so it is used for components of moderate size: by forces_inverse_gpu.py on a GPU, and by
+forces_inverse_cpu.py on a CPU.
 
 | symbol | code | what |
 | --- | --- | --- |
 | Z | `compliance` | float32, one block per component, one after the other; equal components share a block |
 | n_i | `normal` | [V,3]; zero where there is no contact |
-| c_i | `gap` | [V], what is missing along the normal |
+| c_i | `gap` | [V], distance [m] by which a vertex is too close, along the normal |
 | y_i | `force` | [V], zero where there is no contact |
-| S | `coupling` | float32 scratch, with as much room as Z |
+| S | `coupling` | float32 scratch, of the size of Z |
 """
 
 from __future__ import annotations
@@ -34,26 +35,26 @@ from warpgarment.kernels.linear.factor import component_blocks
 from warpgarment.kernels.linear.system import System
 
 LARGEST = 2048
-"""Vertices of the largest component that gets a compliance matrix (16 MB)."""
+"""Largest number of vertices of a component with a compliance matrix (16 MB)."""
 BUDGET = 2**28
-"""Entries of all compliance matrices of a batch together (1 GiB, and as much for scratch while solving)."""
+"""Largest number of entries of all compliance matrices of a batch (1 GiB, and the same for scratch in a solve)."""
 
 
 class Compliance(NamedTuple):
     """Compliance matrices of a packed batch, on one device."""
 
     base: torch.Tensor
-    """int64 [C], where the block of a component begins; -1 for a component without one."""
+    """int64 [C], first entry of the block of each component in `values`; -1 for a component without a block."""
     room: torch.Tensor
-    """int64 [C], where the scratch of a component begins; components never share it."""
+    """int64 [C], first entry of the scratch of each component; components never share scratch."""
     wide: torch.Tensor
-    """int32 [C], where a component begins among vertices in panels of sixteen, the last of each padded."""
+    """int32 [C], first panel of each component, where its vertices are divided into padded panels of sixteen."""
     scratch: int
-    """Entries of the scratch of all components."""
+    """Number of entries of the scratch of all components."""
     inverted: int
-    """Components with a block."""
+    """Number of components with a block."""
     panels: int
-    """Panels of vertices."""
+    """Number of panels of all components."""
     local: torch.Tensor
     """int32 [V], index of a vertex within its component."""
     values: torch.Tensor
@@ -61,7 +62,7 @@ class Compliance(NamedTuple):
 
     @classmethod
     def build(cls, matrix: scipy.sparse.csr_matrix, system: System, largest: int, budget: int) -> Compliance:
-        """Inverts the diagonal blocks of B, [V,V], that are small enough, until the budget is used up."""
+        """Inverts diagonal blocks of B, [V,V], with at most `largest` vertices, as far as `budget` entries allow."""
         device = system.value.device
         rows, start = system.rows.cpu().numpy(), system.start.cpu().numpy()
         local = np.empty(len(rows), np.int32)
@@ -90,5 +91,5 @@ class Compliance(NamedTuple):
 
 
 def _pitch(size: int | np.ndarray) -> int | np.ndarray:
-    """Entries of a row: a multiple of sixteen."""
+    """Number of entries of a padded row, a multiple of sixteen."""
     return (size + 15) // 16 * 16

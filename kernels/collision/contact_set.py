@@ -1,24 +1,24 @@
-"""What a contact is, who finds contacts, and how far each one is from what it asks for.
+"""Contacts, sources of contacts, and the gap of each contact.
 
-Contact k asks that the cloth keeps a distance along a direction n_k from a point U_k of something that is not cloth:
+Contact k requires the cloth to keep a distance along a direction n_k from a point U_k of an obstacle:
 
     n_k · (Σ_j w_kj V_j - U_k) ≥ d_k
 
-or, where both sides are cloth, that one part of it keeps that distance from another: then all vertices are in the
-stencil, with weights of both signs, and U_k is zero. With g_k = Σ_j w_kj e_j ⊗ n_k, solver.py moves the vertices by
+If both sides are cloth, it requires one part to keep that distance from another. Then all vertices are in the stencil,
+with weights of both signs, and U_k is zero. With g_k = Σ_j w_kj e_j ⊗ n_k, solver.py moves the vertices by
 
     (B ⊗ I₃ + Σ_k g_k g_kᵀ) D = Σ_k g_k c_k,    c_k = d_k - n_k·(Σ_j w_kj Ṽ_j - U_k)
 
 | symbol | code | what |
 | --- | --- | --- |
-| n_k | `normal` | unit vector, away from what is touched; zero: no contact |
-| U_k | `anchor` | a point of what is touched, or of its tangent plane |
-| d_k | `distance` | distance to keep |
+| n_k | `normal` | unit vector away from the obstacle; zero for no contact |
+| U_k | `anchor` | a point [m] of the obstacle, or of its tangent plane |
+| d_k | `distance` | distance to keep [m] |
 | V_j, w_kj | `vertex`, `weight` | the stencil: at most four vertices and their weights |
-| c_k | `gap` | what is missing along the normal |
+| c_k | `gap` | distance [m] by which the cloth is too close, along the normal |
 
-Where each vertex has at most one contact, contact k is at vertex k, and there is no stencil. This is the only kind that
-can be solved today.
+If each vertex has at most one contact, contact k is at vertex k, and there is no stencil. Only such contacts can be
+solved now.
 """
 
 from __future__ import annotations
@@ -36,52 +36,52 @@ class Contacts(NamedTuple):
     """K contacts. They are constants of a solve: no gradient flows into them."""
 
     normal: torch.Tensor
-    """n, float64 [K,3]: unit vectors, zero where there is no contact."""
+    """n, float64 [K,3]: unit vectors, zero for no contact."""
     anchor: torch.Tensor
-    """U [m], float64 [K,3]; zero where both sides are in the stencil."""
+    """U [m], float64 [K,3]; zero if both sides are in the stencil."""
     distance: torch.Tensor | float
     """d [m], a number or float [K]."""
     vertex: torch.Tensor | None = None
-    """int32 [K,4], packed vertices, -1 where one is not used; None: contact k is at vertex k, and K = V."""
+    """int32 [K,4], packed vertices, -1 for an unused one; None if contact k is at vertex k, where K = V."""
     weight: torch.Tensor | None = None
-    """w, float64 [K,4]; None where `vertex` is."""
+    """w, float64 [K,4]; None if `vertex` is None."""
 
 
 class ContactFrame(NamedTuple):
-    """What a source of contacts may look at besides the positions: the bodies, and whose vertices these are."""
+    """Inputs of a source of contacts besides the positions: the bodies, and the owners of the vertices."""
 
     bodies: BodyMeshes
     """The bodies in the frame of the positions."""
     body_of_vertex: torch.Tensor | None = None
-    """int32 [V]; -1: of a garment that is not looked at any more. None where there is one body."""
+    """int32 [V]; -1 for vertices of a garment that needs no contacts. None if there is one body."""
     garment_of_vertex: torch.Tensor | None = None
-    """int32 [V]; None where there is one garment."""
+    """int32 [V]; None if there is one garment."""
     epsilon: torch.Tensor | float = 0.004
     """Distance to keep from the bodies [m], a number or float32 [V]."""
     origin: torch.Tensor | None = None
-    """Where each vertex comes from [m], as seen from the bodies, float32 [V,3]; NaN where that is not known."""
+    """Positions of vertices if they had moved with the body [m], float32 [V,3], see `features.carry`, or NaN."""
 
 
 class ContactSource(Protocol):
-    """Finds the contacts of a batch of garments with something."""
+    """Finds contacts of a batch of garments with a kind of obstacle."""
 
     name: str
-    """What is touched, for messages."""
+    """Name of the obstacle, for messages."""
 
     def find(self, vertices: torch.Tensor, frame: ContactFrame) -> Contacts:
         """Contacts of the positions [m], float32 [V,3], on their device.
 
-        Frames are recorded as CUDA graphs: nothing here may wait for the device, such as `.item()` or indexing by a
-        mask, and shapes must not change from frame to frame.
+        Frames are recorded as CUDA graphs. So nothing here may wait for the device, as `.item()` and indexing by a mask
+        do, and shapes must not change from frame to frame.
         """
         ...
 
 
 def one_for_each_vertex(contacts: Contacts, what: str = "contacts") -> Contacts:
-    """The contacts, if they have no stencils.
+    """Returns the contacts, after a check that they have no stencils.
 
     Raises:
-        ValueError: They have; names `what` and the fields.
+        ValueError: They have stencils; the message names `what` and the fields.
     """
     if contacts.vertex is not None or contacts.weight is not None:
         raise ValueError(
@@ -92,14 +92,14 @@ def one_for_each_vertex(contacts: Contacts, what: str = "contacts") -> Contacts:
 
 
 def nearest(found: Sequence[Contacts], vertices: torch.Tensor) -> Contacts:
-    """One contact at each vertex, of those that several sources have found: that with the largest gap.
+    """One contact at each vertex: of those of several sources, the one with the largest gap.
 
     Args:
         found: Contacts of each source, without stencils; at least one.
-        vertices: The positions that they were found for [m], float32 [V,3].
+        vertices: The positions [m] for which they were found, float32 [V,3].
 
     Returns:
-        The contacts of the only source as they are; of several sources, with distances float64 [V].
+        V contacts. Those of a single source are returned unchanged; otherwise distances are float64 [V].
     """
     if len(found) == 1:
         return found[0]
@@ -111,7 +111,7 @@ def nearest(found: Sequence[Contacts], vertices: torch.Tensor) -> Contacts:
 
 
 def _spread(contacts: Contacts) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Normals, anchors and distances, one distance for each contact."""
+    """Normals, anchors and distances of contacts, with the distance expanded to one for each contact."""
     normal, anchor, distance, *_ = contacts
     if isinstance(distance, torch.Tensor):
         return normal, anchor, distance.double()

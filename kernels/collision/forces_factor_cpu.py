@@ -4,19 +4,19 @@ As in compliance.py the unknowns are the forces y, one per contact, and conjugat
 
     (I + S) y = c,    S = Nᵀ B⁻¹ N,    D = B⁻¹ N y
 
-but S is applied and not formed: B⁻¹ costs two sweeps over L (linear/factor.py). A load on contacts reaches the
-ancestors of their places in the elimination tree and nothing else, and displacements at contacts depend on nothing
-else, so that the sweeps of the iteration pass over the panels of these places only, the `active` ones.
+but S is applied without being formed: a product with B⁻¹ takes two sweeps over L (linear/factor.py). A load on contacts
+only reaches the ancestors of their places in the elimination tree, and displacements at contacts only depend on these.
+So the sweeps of the iteration only pass over the panels of these places, which are called `active`.
 
-All eigenvalues of I + S are at least 1. Hence the error in the energy norm is at most |c - (I + S) y|, and this is what
-the iteration is stopped by, at every step. A diagonal preconditioner would not pay: S_ii hardly varies.
+All eigenvalues of I + S are at least 1. Hence the error in the energy norm is at most |c - (I + S) y|, which is the
+stopping criterion of the iteration. A diagonal preconditioner would not help, since S_ii hardly varies.
 
 | symbol | code | what |
 | --- | --- | --- |
 | B = L D Lᵀ | `factor.Factor` | |
-| n_i | `normal` | [V,3]; zero where there is no contact |
-| c_i | `gap` | [V], what is missing along the normal |
-| y_i | `force` | [V], zero where there is no contact |
+| n_i | `normal` | [V,3]; zero at vertices without contact |
+| c_i | `gap` | [V], distance [m] by which a vertex is too close, along the normal |
+| y_i | `force` | [V], zero at vertices without contact |
 """
 
 from __future__ import annotations
@@ -179,19 +179,19 @@ def solve(
     report: torch.Tensor,
     error: torch.Tensor,
 ) -> torch.Tensor:
-    """Forces and displacements of the components that have a factor, which must be in the form for substitution.
+    """Computes forces and displacements of the components that have a factor.
 
     Args:
-        system: Which vertices belong to a component.
-        factor: Of B.
+        system: Division of the vertices into components.
+        factor: Factor of B, in the form for substitution.
         normal: n, float64 [V,3].
-        gap: c, float64 [V].
-        tolerance: Where the iteration stops: |c - (I + S) y| [m], float64 [C].
-        relative: The same as a share of the energy norm of y; the looser of the two holds.
-        max_iterations: Limit per component.
-        increment: D [m], float64 [V,3], written.
-        report: Iterations, int32 [C], negative where the limit ended them, written.
-        error: Bound of the error in the energy norm, float64 [C], written.
+        gap: c [m], float64 [V].
+        tolerance: Value of |c - (I + S) y| [m] at which the iteration stops, float64 [C].
+        relative: Value of the same as a share of the energy norm of y. The looser of the two counts.
+        max_iterations: Limit of iterations per component.
+        increment: Output: D [m], float64 [V,3].
+        report: Output: number of iterations, int32 [C], negative if the limit ended them.
+        error: Output: bound of the error in the energy norm [m], float64 [C].
 
     Returns:
         Forces y, float64 [V].

@@ -1,17 +1,16 @@
-"""Contact forces through compliance matrices on a CPU: one core, sixteen contacts an instruction.
+"""Contact forces through compliance matrices on one CPU core, with vector instructions for sixteen contacts.
 
-The equations are those of compliance.py. What differs is the shape of the loops: S and Z are read in panels of sixteen
-rows, held in vectors of sixteen float32, which Warp's CPU backend turns into vector instructions (one product with S
-takes a tenth of the time of a loop over numbers). Contacts are listed, coupled, solved and turned into displacements in
-one launch, a component per thread.
+The equations are those of compliance.py. S and Z are read in panels of sixteen rows, in vectors of sixteen float32,
+which Warp's CPU backend compiles to vector instructions (a product with S takes a tenth of the time of a scalar loop).
+One launch, with a thread per component, lists the contacts, computes S, solves, and computes the displacements.
 
-The iteration is stopped as in forces_factor_cpu.py, by |c - (I + S) y|, which bounds the error in the energy norm.
+The stopping criterion is that of forces_factor_cpu.py: |c - (I + S) y|, which bounds the error in the energy norm.
 
 | symbol | code | what |
 | --- | --- | --- |
 | Z | `compliance` | rows padded to a multiple of sixteen, see `compliance.Compliance` |
 | S | `panels` | [panel, contact] of sixteen, at `room` |
-| n_i | `nx, ny, nz` | by panels of contacts, at `wide`; zero in what pads the last |
+| n_i | `nx, ny, nz` | in panels of contacts, from `wide` on; zero in padding |
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from warpgarment.kernels.operator import allocate
 from .compliance import Compliance
 
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
-wp.set_module_options({"max_unroll": 1})  # loops over sixteen would be compiled sixteen times, for nothing
+wp.set_module_options({"max_unroll": 1})  # unrolled loops over sixteen would compile longer and run no faster
 
 
 @wp.kernel(enable_backward=False)
@@ -200,7 +199,7 @@ def solve(
     report: torch.Tensor,
     error: torch.Tensor,
 ) -> torch.Tensor:
-    """Forces y, float64 [V], of the components with a compliance matrix. Arguments: as `contact_forces.solve`."""
+    """Forces y, float64 [V], of the components with a compliance matrix; arguments as in `forces_factor_cpu.solve`."""
     vertices, device = len(normal), normal.device
     coupling = allocate((model.scratch,), torch.float32, device)
     place = allocate((16 * model.panels,), torch.int32, device)

@@ -1,4 +1,4 @@
-"""Contact forces through compliance matrices on a GPU: a block of lanes per component. Equations: compliance.py."""
+"""Contact forces through compliance matrices on a GPU, a block of threads per component. Equations: compliance.py."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def solve(
     report: torch.Tensor,
     error: torch.Tensor,
 ) -> torch.Tensor:
-    """Contact forces y, float64 [V], zero without contact. Writes iterations and error of the components it solves."""
+    """Contact forces y, float64 [V], zero without contact; writes `report` and `error` of components with a matrix."""
     end, contacts = listed
     vertices, count = len(normal), len(model.base)
     coupling = allocate((model.scratch,), torch.float32, normal.device)
@@ -289,7 +289,7 @@ def displace(
 def respond(
     system: System, model: Compliance, vertex_component: torch.Tensor, normal: torch.Tensor, load: torch.Tensor
 ) -> torch.Tensor:
-    """n·(Z g) at the contacts, float64 [V]; `load` is g, float64 [V,3]."""
+    """n·(Z g) at the contacts, float64 [V], for a load g, float64 [V,3]; zero elsewhere."""
     gap = allocate((len(normal),), torch.float64, normal.device)
     with torch_stream(normal.device) as device:
         wp.launch(

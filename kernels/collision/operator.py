@@ -1,13 +1,13 @@
 """The collision refinement for given contacts, as a differentiable torch operator. Equations: solver.py.
 
-Each component is solved in the first of these ways that its solver was built for:
+A component is solved by the first of these methods for which its solver has the matrices:
 
-| way | for | file |
+| method | components | file |
 | --- | --- | --- |
 | contact forces through the inverse of B | moderate size, CPU | forces_inverse_cpu.py |
 | | moderate size, GPU | forces_inverse_gpu.py |
 | contact forces through a factor of B | larger, CPU | forces_factor_cpu.py |
-| displacements by conjugate gradients | the rest | conjugate_gradients.py |
+| displacements by conjugate gradients | all others | linear/conjugate_gradients.py |
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from .contact_set import contact_gap
 ADJOINT_TOLERANCE = 1e-6
 """Error of the adjoint solve in the energy norm as a share of the norm of its solution."""
 RESIDUAL = 10.0
-"""Where iterations for contact forces stop: their residual in units of the tolerance.
+"""Residual at which iterations for contact forces stop, in units of the tolerance.
 
-The residual is a bound, and the error in the energy norm a small part of it. Measured on the bundled dress of 500 to
-10,000 faces with 6 to 2,839 contacts: at 2e-5 m the worst vertex is off by 0.008 mm, at 1e-4 m by 0.03 mm.
+The residual is a bound of the error in the energy norm, which is much smaller. Measured on the bundled dress of 500 to
+10,000 faces with 6 to 2,839 contacts: at 2e-5 m the largest error of a vertex is 0.008 mm, at 1e-4 m it is 0.03 mm.
 """
 
 
 class Model(NamedTuple):
-    """What is constant of a solver; it travels through the operators as one list (`operator.pack`)."""
+    """The constants of a solver, which the operators take as one list (`operator.pack`)."""
 
     system: System
     dense: Compliance
     factor: Factor
     vertex_component: torch.Tensor
-    """int32 [V]."""
+    """Component of each vertex, int32 [V]."""
     one_core: bool
-    """Whether solves are laid out for one CPU core."""
+    """Whether solves use the kernels for one CPU core."""
 
 
 def _solve(
@@ -58,17 +58,18 @@ def _solve(
     max_iterations: int,
     load: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Solves (B + N Nᵀ) D = N c, or for the forces n·D that a load on all vertices causes where one is given.
+    """Solves (B + N Nᵀ) D = N c, or with a load g on all vertices (B + N Nᵀ) λ = g for n·λ.
 
     Returns:
-        D float64 [V,3] (not where a load is given), forces float64 [V], iterations int32 [C], error float64 [C].
+        D [m], float64 [V,3] (undefined with a load); forces y, or n·λ with a load, float64 [V]; iterations, int32 [C];
+        error [m], float64 [C].
     """
     system, dense, factor, vertex_component, one_core = model
     count, device = len(tolerance), normal.device
     force = torch.zeros(len(normal), dtype=torch.float64, device=device)
     if dense.inverted + factor.factored < count:
         right = normal * gap[:, None] if load is None else load
-        if dense.inverted + factor.factored:  # the others' loads are zero, which takes no iterations
+        if dense.inverted + factor.factored:  # all other loads are zero, which takes no iterations
             left = (dense.base < 0) & (factor.base < 0)
             right = right * left[vertex_component.long(), None]
         increment, report, error = conjugate_gradients.solve(system, normal, right, tolerance, relative, max_iterations)
@@ -101,7 +102,7 @@ def collision_solve(
     model: list[torch.Tensor],
     max_iterations: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The minimiser of eq. 5 for given contacts. Returns vertices, iterations and error per component."""
+    """The minimiser of eq. 5 for given contacts: positions [m], and iterations and error [m] of each component."""
     vertices, normal, anchor = vertices.contiguous(), normal.contiguous(), anchor.contiguous()
     gap = allocate((len(vertices),), torch.float64, vertices.device)
     with torch_stream(vertices.device) as device:
@@ -143,7 +144,7 @@ def _(
 def collision_solve_backward(
     grad: torch.Tensor, normal: torch.Tensor, tolerance: torch.Tensor, model: list[torch.Tensor], max_iterations: int
 ) -> torch.Tensor:
-    """g - n (n·λ) with A λ = g; n·λ is the force that the gap n·(B⁻¹ g) would cause."""
+    """g - n (n·λ) with A λ = g; n·λ is the force of the contacts for the gap n·(B⁻¹ g)."""
     normal, g = normal.contiguous(), grad.double().contiguous()
     parts = unpack(model, Model)
     system, dense, factor, vertex_component, _ = parts

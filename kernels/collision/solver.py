@@ -1,27 +1,28 @@
-"""Collision refinement: the least change of shape that lifts a garment out of the body.
+"""Collision refinement: moves a garment out of the body with the least change of shape.
 
 Supplement section 2, eq. 2 to 5, for the predicted positions Ṽ. For every vertex in C, the set with signed distance
 below ε, U_i is the closest point of the body surface and n_i the outward direction there:
 
     E(V) = Σ_{i∈C} (n_i·(V_i - U_i) - ε)² + λ_lap ‖L (V - Ṽ)‖² + λ_reg ‖V - Ṽ‖²
 
-(Eq. 2 as printed, ε + n·(V - U), would draw vertices ε below the surface.) With D = V - Ṽ the minimiser solves
+(Eq. 2 as printed, ε + n·(V - U), would move vertices to a depth ε below the surface.) With D = V - Ṽ the minimiser
+solves
 
     (B ⊗ I₃ + blockdiag(n_i n_iᵀ)) D = n_i (ε - n_i·(Ṽ_i - U_i)),    B = λ_lap LᵀL + λ_reg I
 
 where B is constant per garment, the contacts are applied without a matrix, and the right-hand side is zero without
-contacts. It is solved for the contact forces, one per contact, through the inverse or a factor of B, or for D itself
-where there is neither (operator.py).
+contacts. The unknowns are the contact forces, one per contact, if there is an inverse or a factor of B, otherwise D
+(operator.py).
 
 | symbol | code | what |
 | --- | --- | --- |
 | Ṽ, V | `vertices`, result | garment before and after |
-| U_i | `anchor` | closest point of the body surface or, where that is the far side, of the face of entry's plane |
+| U_i | `anchor` | closest point of the body surface; if that is on the far side, of the plane of the face of entry |
 | n_i | `normal` | sign (Ṽ_i - U_i) / |Ṽ_i - U_i|, or the face's normal at the surface and at entry; zero outside C |
 | ε | `epsilon`, `distance` | distance kept from the body |
 | L | `laplacian.cotangent_laplacian` | of the rest mesh, unitless |
 
-These contacts are one kind (body_contacts.py); `solve` takes those of any source (contact_set.py).
+These are contacts with a body (body_contacts.py). `solve` takes contacts of any source (contact_set.py).
 
 The gradient with respect to Ṽ is the adjoint for fixed contacts: V = Ṽ - A⁻¹ n nᵀ Ṽ + const, so one more solve with A.
 """
@@ -50,8 +51,8 @@ from .operator import Model
 TOLERANCE = 2e-6
 """Error of a solve in the energy norm [m].
 
-Measured on skirts of 1,000 to 10,000 faces, 15 mm deep in a body, solved for displacements: the worst vertex is off by
-0.02 to 0.03 mm at 1e-5 or 5e-6 and 0.009 mm at 2e-6. For contact forces see `operator.RESIDUAL`.
+Measured on skirts of 1,000 to 10,000 faces, 15 mm deep in a body, solved for displacements: the largest error of a
+vertex is 0.02 to 0.03 mm at 1e-5 or 5e-6, and 0.009 mm at 2e-6. For contact forces see `operator.RESIDUAL`.
 """
 
 
@@ -59,21 +60,21 @@ class CollisionSolver:
     """Moves garments out of bodies, for a packed batch of rest meshes.
 
     Args:
-        rest_vertices: Rest positions [m], float32 [V,3]; their device is the solver's.
+        rest_vertices: Rest positions [m], float32 [V,3], on the device of the solver.
         faces: Vertex indices, int32 [F,3].
         lambda_lap: Weight of the change of the Laplacian.
         lambda_reg: Weight of the displacement; positive, or the system would be singular.
-        max_iterations: Limit per solve; reaching it warns once.
-        largest_compliance: Components of up to this many vertices are solved through the dense inverse of B, for the
-            contact forces. Zero never inverts.
-        compliance_budget: Entries of all the inverses together, 4 bytes each and as many again while solving.
-        factor_budget: Entries, 12 bytes each, of the factors of B of all other components, which on a CPU are solved
-            through them; what does not fit is solved by conjugate gradients for the displacement.
-        one_core: Whether solves are laid out for one CPU core; None: on a CPU.
+        max_iterations: Limit of iterations per solve; reaching it warns once.
+        largest_compliance: Largest number of vertices of a component that is solved for contact forces through the
+            dense inverse of B. With zero, no block is inverted.
+        compliance_budget: Limit of the entries of all inverses together, 4 bytes each; a solve needs the same again.
+        factor_budget: Limit of the entries of the factors of B, 12 bytes each, through which all other components are
+            solved on a CPU. Components whose factor does not fit are solved by conjugate gradients for displacements.
+        one_core: Whether solves use the kernels for one CPU core; None does so on a CPU.
 
     Raises:
-        ValueError: Wrong shapes, indices out of range, rest faces without area, options out of range.
-        TypeError: Wrong dtypes.
+        ValueError: Shapes are wrong, indices or options are out of range, or rest faces have no area.
+        TypeError: A dtype is wrong.
     """
 
     def __init__(
@@ -115,18 +116,23 @@ class CollisionSolver:
 
     @property
     def iterations(self) -> int:
-        """Iterations of the last refinement: the largest of all components, summed over the passes."""
+        """Number of iterations of the last refinement: the largest of all components, summed over the passes."""
         return self._progress.iterations
 
     def summary(self) -> torch.Tensor:
-        """Iterations of the last refinement, components stopped by the limit and their largest error [m]; float64 [3].
+        """Report of the last refinement: iterations, number of components stopped by the limit, their largest error.
 
-        Stays on the device: give it to `warn_if_stopped` once it has been read.
+        float64 [3] on the solver's device, the error in metres; does not wait for the solve.
         """
         return self._progress.summary()
 
     def warn_if_stopped(self, stopped: float, error: float) -> None:
-        """Warns, once, if a summary that was read from the device counts components that were stopped."""
+        """Warns, once, if components were stopped by the limit.
+
+        Args:
+            stopped: Number of components that were stopped, from a `summary` that was read from the device.
+            error: Largest error of those components [m], from that summary.
+        """
         self._progress.warn_if_stopped(stopped, self.component_count, error)
 
     @property
@@ -152,21 +158,21 @@ class CollisionSolver:
         Args:
             vertices: Predicted positions [m], float32 [V,3].
             bodies: The bodies in the frame of `vertices`.
-            body_of_vertex: Body of each vertex, int32 [V]; None where there is one body.
-            epsilon: Distance kept from the body [m]: a number, or float32 [V] with one for each vertex.
-            origin: Where each vertex comes from [m], float32 [V,3], in the frame of `bodies`; NaN where that is not
-                known. A vertex past the middle of a limb is led back to the side where it went in. None: all leave by
-                the nearest way.
-            passes: How often detection and solve are done, each from the result of the one before.
-            tolerance: Where the iteration stops: error in the energy norm [m]. The default keeps every vertex within
+            body_of_vertex: Body of each vertex, int32 [V]; None if there is one body.
+            epsilon: Distance to keep from the body [m]: a number, or float32 [V] with one for each vertex.
+            origin: Position of each vertex if it had moved with its body [m], float32 [V,3]; NaN if unknown. A vertex
+                past the middle of a limb is moved to the side on which it entered. None moves all vertices to the
+                nearest point of the surface.
+            passes: Number of times that contacts are found and solved, each time from the last result.
+            tolerance: Error in the energy norm [m] at which the iteration stops. The default keeps every vertex within
                 0.02 mm of the exact minimiser.
 
         Returns:
-            Positions [m], float32 [V,3]; components without contacts come back unchanged.
+            Positions [m], float32 [V,3]; those of components without contacts are unchanged.
 
         Raises:
-            ValueError: Wrong shape or device, options out of range.
-            TypeError: Wrong dtype.
+            ValueError: A shape or device is wrong, or an option is out of range.
+            TypeError: A dtype is wrong.
         """
         expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
         if body_of_vertex is not None:
@@ -193,15 +199,15 @@ class CollisionSolver:
 
         Args:
             vertices: Predicted positions [m], float32 [V,3].
-            contacts: At most one for each vertex: K = V, without stencils.
-            tolerance: Where the iteration stops, as in `refine`.
+            contacts: One contact for each vertex, K = V, without stencils.
+            tolerance: Error in the energy norm [m] at which the iteration stops, as in `refine`.
 
         Returns:
-            Positions [m], float32 [V,3]; components without contacts come back unchanged.
+            Positions [m], float32 [V,3]; those of components without contacts are unchanged.
 
         Raises:
-            ValueError: Contacts with stencils; wrong shape or device; a tolerance that is not positive.
-            TypeError: Wrong dtype.
+            ValueError: Contacts have stencils, a shape or device is wrong, or the tolerance is not positive.
+            TypeError: A dtype is wrong.
         """
         expect("vertices", vertices, (self.vertex_count, 3), device=self.device)
         one_for_each_vertex(contacts)
@@ -219,7 +225,7 @@ class CollisionSolver:
         return torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
 
     def _solve(self, vertices: torch.Tensor, contacts: Contacts, limit: torch.Tensor, *, first: bool) -> torch.Tensor:
-        """One solve; its report replaces those of earlier ones if it is the first of a refinement."""
+        """One solve; the first one of a refinement resets the report."""
         normal, anchor, distance, *_ = contacts
         if isinstance(distance, torch.Tensor):  # n.(V - U) - d = n.(V - (U + d n)), so the operator's distance is zero
             anchor, distance = anchor + distance[:, None] * normal, 0.0
@@ -244,21 +250,22 @@ def refine(
     lambda_reg: float = 1e-3,
     passes: int = 1,
 ) -> torch.Tensor:
-    """One garment and one body: builds a `CollisionSolver` and refines once.
+    """Refines one garment on one body with a new `CollisionSolver`.
 
     Args:
         vertices: Predicted positions [m], float32 [V,3].
         faces: Vertex indices, int32 [F,3].
         body_vertices: Body positions [m], float32 [U,3].
         body_faces: Body vertex indices, int32 [G,3].
-        rest_vertices: Rest positions [m], float32 [V,3], for the Laplacian; `vertices` when None.
-        epsilon, lambda_lap, lambda_reg, passes: As in `CollisionSolver`.
+        rest_vertices: Rest positions [m], float32 [V,3], for the Laplacian; None takes `vertices`.
+        epsilon, passes: Options of `CollisionSolver.refine`.
+        lambda_lap, lambda_reg: Options of `CollisionSolver`.
 
     Returns:
         Positions [m], float32 [V,3]. Differentiable in `vertices` with the contacts held fixed.
 
     Raises:
-        ValueError, TypeError: As `CollisionSolver`.
+        ValueError, TypeError: As for `CollisionSolver` and `CollisionSolver.refine`.
     """
     expect("vertices", vertices, (None, 3))
     rest = vertices if rest_vertices is None else rest_vertices

@@ -1,4 +1,4 @@
-"""What a network sees of each face: its deformation, its place, and the body nearby."""
+"""Features of each face for a network: its deformation, its position, and the body nearby."""
 
 from .channels import FEATURES, LAYOUT
 from .face import BodyInteraction, body_interaction, face_features

@@ -1,12 +1,12 @@
-r"""Where vertices would be had they moved with the body: where they come from, as seen from the body.
+r"""Positions that vertices would have if they had moved with the body: their origins for the collision refinement.
 
     V' = U + q̄ + D (V - U + l n),    U = c + |d| v̄,    n = -sign(d) v̄
 
-with c the centroid of one face at the vertex and d, v̄, D, q̄ of face.py what that face knows of the nearest body
-face: U is the nearest body point, n points out of the body there, D and q̄ are how it will move. No query is needed, as
-the features of a frame have been asked for already. Collision refinement follows a vertex from V' to its predicted
-position to find where it went in. A vertex that was left a little inside is lifted out, by l, to begin with: from
-inside, the first surface on the way would be the far one.
+where c is the centroid of one face at the vertex, and d, v̄, D, q̄ are the features of that face (face.py): U is the
+nearest point of the body, n the outward direction there, D and q̄ the motion of the nearest body face. No query is
+needed, as the features of the frame have been computed already. Collision refinement follows a vertex from V' to its
+predicted position to find the face by which it entered. Every vertex is first lifted by l along n: from a position
+slightly inside, the first surface on the way would be the far one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from warpgarment.kernels.operator import allocate
 from .channels import FEATURES, LAYOUT
 
 LIFT = wp.constant(0.005)
-"""l [m], more than the depth at which refinement leaves all but a few vertices."""
+"""l [m], more than the depth of almost all vertices after a refinement."""
 DISTANCE = wp.constant(LAYOUT["signed_distance"].start)
 DIRECTION = wp.constant(LAYOUT["direction_to_body"].start)
 DEFORMATION = wp.constant(LAYOUT["body_deformation"].start)
@@ -63,7 +63,7 @@ def carried_kernel(
 
 
 def face_at_each_vertex(faces: torch.Tensor, vertex_count: int) -> torch.Tensor:
-    """The face of lowest index at each vertex, -1 where there is none; [F,3] -> int32 [V]."""
+    """The face of lowest index at each vertex, -1 for a vertex without faces; [F,3] -> int32 [V]."""
     numbers = torch.arange(len(faces), dtype=torch.int32, device=faces.device).repeat_interleave(3)
     found = torch.full((vertex_count,), len(faces), dtype=torch.int32, device=faces.device)
     found = found.scatter_reduce(0, faces.reshape(-1).long(), numbers, "amin")
@@ -79,10 +79,10 @@ def carried(
         vertices: Positions in frame t [m], float32 [V,3].
         faces: Vertex indices, int32 [F,3].
         face_of_vertex: A face at each vertex, int32 [V], see `face_at_each_vertex`.
-        features: Of frame t, float32 [F,34].
+        features: Features of frame t, float32 [F,34].
 
     Returns:
-        Positions [m], float32 [V,3]; NaN at vertices of no face.
+        Positions [m], float32 [V,3]; NaN at vertices without faces.
     """
     device = vertices.device
     expect("vertices", vertices, (None, 3))

@@ -1,4 +1,4 @@
-"""Which numbers describe a face, and how each of them turns, mirrors and rests: the one table that says so.
+"""The table of feature channels: how each one turns, mirrors, and is at rest.
 
     | kind      | the world is turned by G, the rest pose by J | mirrored in x, M = diag(-1, 1, 1) |
     | --------- | -------------------------------------------- | --------------------------------- |
@@ -8,8 +8,8 @@
     | FROM_REST | G A J^T                                      | M A M                             |
     | POINT     | G (p - origin), see `Layout.centred`         | M p                               |
 
-Maps are 3 x 3 and row-major. Faces of a mirrored garment run the other way round, so that normals still point outward.
-A new channel is a row here and an expression in `write_features` (face.py); everything else follows from the table.
+Maps are 3 x 3 and row-major. Faces of a mirrored garment have the opposite winding, so that normals still point
+outward. A new channel is a row of `FACE` and an expression in `write_features` (face.py); all else follows from it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import torch
 
 
 class Kind(Enum):
-    """How a channel turns and mirrors, see above."""
+    """Behaviour of a channel under turns and mirrors, see the table above."""
 
     SCALAR = "scalar"
     VECTOR = "vector"
@@ -32,17 +32,17 @@ class Kind(Enum):
     POINT = "point"
 
 
-_WIDTHS = {Kind.VECTOR: 3, Kind.MAP: 9, Kind.FROM_REST: 9, Kind.POINT: 3}  # of a scalar: any
+_WIDTHS = {Kind.VECTOR: 3, Kind.MAP: 9, Kind.FROM_REST: 9, Kind.POINT: 3}  # a scalar may have any width
 
 
 class Channel(NamedTuple):
-    """Some numbers of a face that belong together."""
+    """Numbers of a face that form one quantity."""
 
     name: str
     width: int
     kind: Kind
     at_rest: Literal["keep", "zero", "identity"] = "keep"
-    """What becomes of it where the body does not move."""
+    """Its value if the body does not move."""
     length: bool = False
     """Whether it has the unit of a length and grows with the scene."""
 
@@ -54,7 +54,7 @@ class Layout:
         channels: The channels, from the first column to the last.
 
     Raises:
-        ValueError: A width that does not go with the kind, or a name that occurs twice.
+        ValueError: A width does not fit the kind, or a name occurs twice.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
@@ -77,7 +77,7 @@ class Layout:
         """Some of the channels, in the order given.
 
         Raises:
-            ValueError: A name that is not there, or twice.
+            ValueError: There is no such name, or it is given twice.
         """
         known = dict(zip(self.names, self.channels, strict=True))
         for name in names:
@@ -86,7 +86,7 @@ class Layout:
         return Layout([known[name] for name in names])
 
     def take(self, rows: torch.Tensor, names: Sequence[str]) -> torch.Tensor:
-        """The columns of some channels of rows [...,K], in the order of the names; the rows themselves for all."""
+        """The columns of some channels of rows [...,K], in the order of the names; for all of them, the rows."""
         if tuple(names) == self.names:
             return rows
         return torch.cat([rows[..., self.slices[name]] for name in names], dim=-1)
@@ -94,22 +94,22 @@ class Layout:
     def turn(
         self, world: torch.Tensor, rest: torch.Tensor | None = None, scale: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """The matrices that turn a row, for the row as a column vector.
+        """Matrices that turn rows, to be multiplied with the row as a column vector.
 
-        Row-major maps turn by Kronecker products: vec(G A J^T) = (G x J) vec(A).
+        Row-major maps turn by Kronecker products: vec(G A J^T) = (G ⊗ J) vec(A).
 
         Args:
             world: Rotation G of garment and body, shape [R,3,3].
-            rest: Rotation J of the rest pose, shape [R,3,3]; None: it does not turn.
-            scale: Factor of all lengths, shape [R]; None: 1.
+            rest: Rotation J of the rest pose, shape [R,3,3]; None if it is not turned.
+            scale: Factor of all lengths, shape [R]; None for 1.
 
         Returns:
-            Shape [R,K,K].
+            Matrices, shape [R,K,K].
         """
         turn = torch.eye(self.width, dtype=world.dtype, device=world.device).repeat(len(world), 1, 1)
         if rest is None:
             rest = torch.eye(3, dtype=world.dtype, device=world.device).expand_as(world)
-        # Maps before vectors: gradients of G are summed in this order, and a training's losses follow from their bits
+        # Maps come before vectors: gradients of G are summed in this order, on which the bits of training losses depend
         for channel in sorted(self.channels, key=lambda channel: _WIDTHS.get(channel.kind) == 3):
             place, factor = self.slices[channel.name], scale if channel.length else None
             if channel.kind is Kind.SCALAR:
@@ -125,15 +125,15 @@ class Layout:
         return turn
 
     def mirror(self, device: torch.device) -> torch.Tensor:
-        """Signs that a mirror in x gives the columns, shape [K]; kept, since a copy to a GPU would wait for it."""
+        """Signs of the columns under a mirror in x, shape [K]; cached, since a copy to a GPU would wait for it."""
         return _signs(self, device)
 
     def centred(self, rows: torch.Tensor, origin: torch.Tensor) -> torch.Tensor:
-        """Rows whose points are relative to an origin, so that a turn is one about it.
+        """Rows with points relative to an origin, so that `turn` turns them about it.
 
         Args:
-            rows: Shape [...,K]; not changed.
-            origin: Shape [...,3], of as many dimensions as the rows, or [3].
+            rows: Rows, shape [...,K]; not changed.
+            origin: Origin [m], shape [3], or [...,3] with the number of dimensions of the rows.
         """
         moved = rows.clone()
         for channel in self.channels:
@@ -142,7 +142,7 @@ class Layout:
         return moved
 
     def still(self, rows: torch.Tensor) -> torch.Tensor:
-        """What rows [...,K] would be had the body not moved; a copy."""
+        """A copy of rows [...,K] with the values for a body that does not move."""
         rows = rows.clone()
         for channel in self.channels:
             place = rows[..., self.slices[channel.name]]
@@ -177,7 +177,7 @@ FACE = Layout(
         Channel("singular_values", 3, Kind.SCALAR),
     )
 )
-"""What a network may see of a face; face.py says what each channel is."""
+"""Channels of a face that a network can read; face.py defines each of them."""
 
 INTERACTION = Layout(
     (
@@ -187,6 +187,6 @@ INTERACTION = Layout(
         Channel("velocity", 3, Kind.VECTOR, at_rest="zero", length=True),
     )
 )
-"""What is kept of a `BodyInteraction`: all of it but the number of the body face."""
+"""Channels of a stored `BodyInteraction`: all its fields except the index of the body face."""
 
 FEATURES, LAYOUT = FACE.width, FACE.slices

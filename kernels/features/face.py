@@ -1,17 +1,17 @@
-"""What the network sees of a face: 34 numbers per face and frame.
+"""Features of a face for the network: 34 numbers per face and frame.
 
-In two launches, of which the first may be kept and the second has gradients; `frame_features` does both in one, for
-all faces of all garments on all bodies, bit by bit what the two give.
+They are computed in two launches: the result of `body_interaction` can be stored, and `face_features` has gradients.
+`frame_features` does both in one launch, for all faces of all garments on all bodies, with exactly the same result.
 
-Manifold-aware transformers, section 4.2 and, for their order, f_i in section 4.3.
+Manifold-aware transformers, section 4.2; the order is that of f_i in section 4.3.
 
     f_i = (Φ_i, n_i, c_i − z, d_i, v̄_i, D_i, q̄_i, Σ_i)
 
     | paper | code                 | what                                                              |
     | ----- | -------------------- | ----------------------------------------------------------------- |
-    | Φ     | deformation_gradient | against the rest pose, row-major                                  |
+    | Φ     | deformation_gradient | from the rest pose, row-major                                     |
     | n     | normal               | unit normal                                                       |
-    | c − z | centroid             | of the face, less z, the garment's mean of these [m]              |
+    | c − z | centroid             | of the face, minus z, the mean centroid of the garment [m]        |
     | d     | signed_distance      | of the centroid to the body [m]                                   |
     | v̄     | direction_to_body    | unit vector from the centroid to the nearest body point           |
     | D     | body_deformation     | of the nearest body face from t to t+1, Q_next Q⁻¹ (there: d_i)   |
@@ -36,16 +36,16 @@ from warpgarment.kernels.sdf.closest import MAX_DISTANCE, Bodies, closest_on_bod
 from .channels import FEATURES, LAYOUT
 
 AT = {name: place.start for name, place in LAYOUT.items()}
-TOUCHING = wp.constant(1.0e-9)  # metres; closer than this, a point has no direction to the body
-# Height over longest edge; the motion of thinner body faces is mostly rounding
+TOUCHING = wp.constant(1.0e-9)  # metres; closer points have no direction to the body
+# Least ratio of height to longest edge of a body face; the motion of thinner faces is mostly rounding
 SLIVER = wp.constant(wp.float64(1.0e-4))
 
 
 class BodyInteraction(NamedTuple):
-    """What each garment face needs to know of its body; holds for as long as garment and body move little.
+    """The nearest point of the body and its motion for each garment face; also usable for slightly displaced garments.
 
-    Where no body point was found (see `BodyQuery`), closest is NaN, sign +1, face -1, deformation the identity,
-    velocity zero.
+    If no body point was found (see `BodyQuery`), closest is NaN, sign is +1, face is -1, deformation is the identity,
+    and velocity is zero.
     """
 
     closest: torch.Tensor
@@ -55,7 +55,7 @@ class BodyInteraction(NamedTuple):
     face: torch.Tensor
     """Packed index of the nearest body face, int32 [F]."""
     deformation: torch.Tensor
-    """Deformation gradient of that face from t to t+1, float32 [F, 3, 3]; the identity where the face has no area."""
+    """Deformation gradient of that face from t to t+1, float32 [F, 3, 3]; the identity if the face has no area."""
     velocity: torch.Tensor
     """Displacement of that face's centroid from t to t+1 [m per frame], float32 [F, 3]."""
 
@@ -129,7 +129,7 @@ def face_and_mean(
     garment_mean: wp.array[wp.vec3],
     features: wp.array2d[wp.float32],
 ):
-    """Corners of face i and its garment's mean, and whether there are such: where not, its features are NaN."""
+    """Corners of face i and its garment's mean, and whether all of them exist; if not, the features become NaN."""
     face = faces[i]
     garment = garment_of_face[i]
     exist = corners_exist(face, vertices.shape[0]) and garment >= 0 and garment < garment_mean.shape[0]
@@ -234,16 +234,16 @@ _face_features = row_operator(
 def body_interaction(
     centroids: torch.Tensor, body_of_face: torch.Tensor | None, bodies: BodyMeshes, next_vertices: torch.Tensor
 ) -> BodyInteraction:
-    """The nearest body point of each garment face, and how the body face there moves in the coming frame.
+    """The nearest body point of each garment face, and the motion of the body face there from t to t+1.
 
     Args:
         centroids: Centroids of the garment's faces [m], float32 [F, 3].
         body_of_face: Body of each garment face, int32 [F]; None if there is one body.
         bodies: The bodies at time t.
-        next_vertices: Their vertices at t+1 [m], float32 [U, 3].
+        next_vertices: Vertices of the bodies at t+1 [m], float32 [U, 3].
 
     Returns:
-        See `BodyInteraction`; without gradients.
+        The interactions, without gradients.
     """
     expect("centroids", centroids, (None, 3), device=bodies.device)
     expect("next_vertices", next_vertices, tuple(bodies.vertices.shape), device=bodies.device)
@@ -288,21 +288,21 @@ def face_features(
     garment_mean: torch.Tensor,
     interaction: BodyInteraction,
 ) -> torch.Tensor:
-    """The network's input for one frame, not normalised.
+    """Features of one frame, not normalised.
 
-    Distance and direction are those from the present centroids to `interaction.closest`, so an interaction may serve a
-    garment that was moved a little since.
+    Distance and direction are computed from the given positions and `interaction.closest`, so an interaction can also
+    be used for a slightly displaced garment.
 
     Args:
-        inverse_rest: From `deformation.inverse_rest_frames`, float32 [F, 3, 3].
+        inverse_rest: Result of `deformation.inverse_rest_frames`, float32 [F, 3, 3].
         vertices: Garment positions [m], float32 [V, 3].
-        faces: int32 [F, 3].
-        garment_of_face: Garment each face belongs to, int32 [F].
+        faces: Vertex indices, int32 [F, 3].
+        garment_of_face: Garment of each face, int32 [F].
         garment_mean: Mean of the face centroids of each garment [m], float32 [B, 3].
-        interaction: From `body_interaction`.
+        interaction: Result of `body_interaction`.
 
     Returns:
-        float32 [F, 34]; columns as in `LAYOUT` (channels.py). Differentiable in vertices and garment_mean.
+        Features, float32 [F, 34]; columns as in `LAYOUT` (channels.py). Differentiable in vertices and garment_mean.
     """
     expect_mesh(vertices, faces)
     rows, device = faces.shape[0], vertices.device
@@ -361,14 +361,14 @@ def frame_features(
     bodies: BodyMeshes,
     next_vertices: torch.Tensor,
 ) -> torch.Tensor:
-    """`face_features` with the `body_interaction` of the faces' centroids, in one launch and without gradients.
+    """Features of one frame, not normalised, with the interaction: in one launch and without gradients.
 
     Args:
-        inverse_rest, vertices, faces, garment_of_face, garment_mean: As in `face_features`.
-        body_of_face, bodies, next_vertices: As in `body_interaction`.
+        inverse_rest, vertices, faces, garment_of_face, garment_mean: Arguments of `face_features`.
+        body_of_face, bodies, next_vertices: Arguments of `body_interaction`.
 
     Returns:
-        float32 [F, 34]; columns as in `LAYOUT` (channels.py).
+        Features, float32 [F, 34]; columns as in `LAYOUT` (channels.py).
     """
     expect_mesh(vertices, faces)
     rows, device = faces.shape[0], bodies.device

@@ -9,8 +9,8 @@ w |(V_a - V_b) - Φ_i (X_a - X_b)|², so that V* solves L V = G(Φ). The solve i
 
     (L + W) D = g,    g_a = -Σ_edges w ((V⁰_a - V⁰_b) - Φ_i (X_a - X_b)) + W_a (t_a - V⁰_a)
 
-whose right-hand side is summed from differences and therefore small and exact when the guess is good. L leaves the
-translation of a component free: it follows from the pins W, or else from `mean`, the wanted mean of the face centroids.
+whose right-hand side is a sum of differences, and therefore small and exact for a good guess. L does not determine the
+translation of a component; it follows from the pins W, or without pins from `mean`, the wanted mean of face centroids.
 
 | symbol | code | what |
 | --- | --- | --- |
@@ -47,8 +47,8 @@ TOLERANCE = 3e-7
 """Error of conjugate gradients in the energy norm as a share of the rest bounding box diagonal.
 
 Measured on skirts, sheets with obtuse triangles and narrow strips of 280 to 9,600 faces, from near and far guesses:
-the worst vertex is off by up to 7e-5 of the diagonal at 1e-5, 1.4e-5 at 1e-6, and 2e-6 at 3e-7, for some 15 % more
-iterations than at 1e-5.
+the largest error of a vertex is 7e-5 of the diagonal at 1e-5, 1.4e-5 at 1e-6, and 2e-6 at 3e-7, which takes some 15 %
+more iterations than 1e-5.
 """
 
 
@@ -58,7 +58,7 @@ class PoissonSolver:
     A batch is a union of connected components, and each of them is a system of its own.
 
     Args:
-        rest_vertices: Rest positions [m], float32 [V,3]; their device is the solver's.
+        rest_vertices: Rest positions [m], float32 [V,3], on the device of the solver.
         faces: Vertex indices, int32 [F,3].
         pins: Vertices held by soft constraints, integers [P], no vertex twice.
         pin_weight: Stiffness of a pin, in units of the mean diagonal entry of the Laplacian.
@@ -72,9 +72,9 @@ class PoissonSolver:
             they are inverted on a GPU only.
 
     Raises:
-        ValueError: Wrong shapes, indices out of range, a pin given twice, rest faces without area, or options that are
-            not positive.
-        TypeError: Wrong dtypes.
+        ValueError: Shapes are wrong, indices are out of range, a pin is given twice, rest faces have no area, or
+            options are not positive.
+        TypeError: A dtype is wrong.
     """
 
     def __init__(
@@ -193,8 +193,8 @@ class PoissonSolver:
             Positions [m], float32 [V,3].
 
         Raises:
-            ValueError: Wrong shape or device, or pin_targets missing.
-            TypeError: Wrong dtype.
+            ValueError: A shape or device is wrong, or pin_targets are missing.
+            TypeError: A dtype is wrong.
         """
         device = self.rest_vertices.device
         expect("phi", phi, (len(self.faces), 3, 3), device=device)

@@ -15,6 +15,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels.launch import as_warp, expect, torch_stream
+from warpgarment.kernels.mesh.caps import caps_of
 
 from . import inside, nearest_face
 from .closest import Bodies, query_bodies
@@ -78,7 +79,7 @@ class BodyMeshes:
         self._faces = faces.detach().clone(memory_format=torch.contiguous_format)
         local = self._faces - first_vertex[:, None]
         host = self._faces.cpu().numpy()
-        caps = inside.caps_of(host, len(vertices), starts)
+        caps = caps_of(host, len(vertices), starts)
         many = [int(caps.loops[b] - caps.loops[a]) > inside.MOST_CAPS for a, b in pairwise(caps.bodies.tolist())]
         self._meshes: list[wp.Mesh] = []
         with torch_stream(vertices.device):

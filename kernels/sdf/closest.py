@@ -40,7 +40,7 @@ class Bodies:
     vertices: wp.array[wp.vec3]
     rings: wp.array2d[wp.int32]  # faces that share a corner or an edge, see nearest_face.rings_of
     scattered: wp.array[wp.int32]  # whether a body has too many holes to be closed by caps
-    loop_offsets: wp.array[wp.int32]  # loops of each body, see inside.Caps
+    loop_offsets: wp.array[wp.int32]  # loops of each body, see mesh.caps.Caps
     loops: wp.array[wp.int32]
     caps: wp.array[wp.vec3i]
     loop_size: wp.array[wp.vec2]

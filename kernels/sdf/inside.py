@@ -25,11 +25,7 @@ A cap that is too small and too far to matter is skipped. Caps are searched one 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 import warp as wp
 
 MOST_CAPS = 512
@@ -39,51 +35,6 @@ ZERO = wp.constant(wp.float64(0.0))
 NEGLIGIBLE = wp.constant(wp.float64(0.01))  # a loop whose winding number is below this is at first only bounded
 ROUNDING = wp.constant(wp.float64(1.0e-6))  # rounding error of a sum of solid angles
 PER_TURN = wp.constant(wp.float64(1.0 / (4.0 * np.pi)))
-
-
-class Caps(NamedTuple):
-    """Triangles that close the holes of a packed batch of bodies."""
-
-    triangles: np.ndarray
-    """Packed vertex indices of the caps, loop by loop, int32 [K, 3]; the first corner is the fan's centre."""
-    loops: np.ndarray
-    """Index at which the caps of each loop begin, and K, int32 [L + 1]."""
-    bodies: np.ndarray
-    """Index at which the loops of each body begin, and L, int32 [B + 1]."""
-
-
-def caps_of(faces: np.ndarray, vertex_count: int, vertex_starts: list[int]) -> Caps:
-    """Fans that close bodies; closed bodies get none.
-
-    Args:
-        faces: Packed vertex indices, integers [G, 3], in any orientation; any number of faces may share an edge.
-        vertex_count: Number of vertices U.
-        vertex_starts: Index at which the vertices of each body begin, and U, [B + 1].
-    """
-    faces = faces.astype(np.int64)
-    start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    keys, edge = np.unique(low * vertex_count + high, return_inverse=True)
-    net = np.bincount(edge, np.where(start < end, 1, -1), len(keys)).astype(np.int64)  # low to high less high to low
-    net[keys // vertex_count == keys % vertex_count] = 0
-    keys, net = np.repeat(keys, np.abs(net)), np.repeat(np.sign(net), np.abs(net))
-    low, high = keys // vertex_count, keys % vertex_count
-    start, end = np.where(net > 0, low, high), np.where(net > 0, high, low)
-    graph = scipy.sparse.coo_matrix((np.ones(len(keys)), (start, end)), (vertex_count, vertex_count))
-    _, loop_of_vertex = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    loop_of_edge = loop_of_vertex[start]
-    centre = np.full(vertex_count, vertex_count)
-    np.minimum.at(centre, loop_of_edge, start)
-    triangles = np.stack([centre[loop_of_edge], end, start], axis=1)  # the edge in the opposite direction
-    triangles = triangles[(triangles[:, 0] != triangles[:, 1]) & (triangles[:, 0] != triangles[:, 2])]
-    triangles = triangles[np.argsort(triangles[:, 0], kind="stable")]
-    centres, first = np.unique(triangles[:, 0], return_index=True)
-    loops = np.append(first, len(triangles))
-    return Caps(
-        triangles.astype(np.int32).reshape(-1, 3),
-        loops.astype(np.int32),
-        np.searchsorted(centres, vertex_starts).astype(np.int32),
-    )
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""`python -m benchmarks`, every part on a tiny garment, and what it counts by hand."""
+"""`python -m benchmarks`: every part on a tiny garment, and counts compared with ones made by hand."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ EXPECTED = {  # part: what its rows must be about, and references beside them
 
 @pytest.mark.parametrize("part", EXPECTED)
 def test_each_part_writes_its_rows(part, tmp_path, monkeypatch):
-    """A part would end without its files, lose a yardstick without a word, or leave a figure out."""
+    """A part would end without its files, omit a reference without a note, or leave a figure out."""
     monkeypatch.setitem(SECONDS, True, 0.01)
     monkeypatch.setitem(roofline.MATRIX, "cpu", 64)
     monkeypatch.setattr(manifold, "POOLED_FROM", 100)
@@ -89,7 +89,7 @@ def test_each_part_writes_its_rows(part, tmp_path, monkeypatch):
 
 
 def test_network_bytes():
-    """The roofline would lie. By hand, for one layer without manifold heads: bytes of every operator.
+    """The roofline would be wrong. By hand, for one layer without manifold heads: bytes of every operator.
 
     E = 8, W = 16, T = 3 + 1 tokens, in units of numbers: two norms read and write 4 E T, q, k, v read E and write 3 E,
     attention reads 3 E and writes E, the output 2 E, two sums 3 E each, the feed-forward 2 E and the hidden layer
@@ -102,7 +102,9 @@ def test_network_bytes():
 
 
 def test_network_bytes_of_patches():
-    """The same of a network of patches, for 2 patches of 5 faces, F = 4, G = 6, K = 1, and the layer above on 2 + 1.
+    """The roofline of a network of patches would be wrong.
+
+    By hand, for 2 patches of 5 faces, F = 4, G = 6, K = 1, and the layer of the test above on 2 + 1 tokens.
 
     A face, in numbers: embedded F; before: norm 2 F, F + G, 2 G, G + F, sum 3 F; pooled F; spread F, sum 3 F; after
     likewise with neighbours read and written 2 F, F + G and a sum of hidden layers 3 G; norm 2 F, answer F + 12. A

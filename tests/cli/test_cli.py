@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ import torch
 from support import meshes
 
 from warpgarment import cli
+from warpgarment.errors import OutputError
+from warpgarment.io.disk.outputs import check_space
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
@@ -230,6 +233,17 @@ WRONG = [
     "view BODY --out DIR/a.mp4 --azimuth inf",
     "view BODY --out BAND/a.png",
     "evaluate --data DIR --out BAND/x --device cpu",
+    "evaluate --data DIR --out DIR/x --device gpu",
+    "generate --out DIR/new --device gpu --bodies bundled",
+    "generate --out DIR/new --device cuda:99 --bodies bundled",
+    "generate --out BAND/x --bodies bundled",
+    "generate --out DIR/new --bodies bundled --sequences 100000000000",
+    "train --data DIR --out BAND/x --steps 1",
+    "train --data DIR --out DIR/new --steps 1 --device gpu",
+    "dataset import BAND BAND/x",
+    "dataset import BODY DIR",
+    "dataset card DIR --out BAND/x",
+    "simulate BAND BODY --out DIR/band.pc2 --device cpu",
     "dataset verify DIR --json BAND/x.json",
 ]
 
@@ -270,6 +284,32 @@ def test_outputs_are_tried_before_the_simulation(scene, capsys, monkeypatch) -> 
     assert "slash" in _error(capsys, *common, scene / "a.v1")
     monkeypatch.setitem(sys.modules, "pxr", None)
     assert 'pip install "warpgarment[usd]"' in _error(capsys, *common, scene / "a.USDA")
+
+
+def test_room_on_the_disk_is_asked_for(scene, capsys, monkeypatch) -> None:
+    """Hours of work end with a full disk, where what is missing could be said at the beginning."""
+    from collections import namedtuple
+
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr("shutil.disk_usage", lambda _: usage(10**12, 10**12 - 50, 50))
+    out = scene / "new"
+    words = ("simulate", scene / "band.obj", scene / "body.npz", "--device", "cpu", "--unit", "cm", "--out", out)
+    for verb in (words, ("generate", "--bodies", "bundled", "--out", out)):
+        assert re.search(r"about \d+ MB would be written, and 0 MB are free", _error(capsys, *verb))
+        assert not out.exists()
+    with pytest.raises(OutputError, match="about 9 MB would be written"):
+        check_space(scene / "a" / "b", 9e6)
+    check_space(scene / "a" / "b", 50)
+
+
+def test_the_mesh_beside_a_point_cache_is_no_input(scene, capsys) -> None:
+    """`--out band.pc2` writes its first frame to band.obj, and the garment of that name is lost."""
+    BodyMotion.load(scene / "body.npz").save(scene / "walk.pc2")
+    before = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()}
+    words = ("simulate", scene / "band.obj", scene / "body.npz", "--device", "cpu", "--out", scene / "band.pc2")
+    assert "band.obj is read" in _error(capsys, *words)
+    assert "walk.obj is read" in _error(capsys, "convert", scene / "walk.pc2", scene / "walk.PC2")
+    assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == before
 
 
 def test_folders_of_any_name(scene) -> None:

@@ -18,7 +18,7 @@ def _run(name: str, **settings) -> None:
 
 
 def test_every_example_is_tested() -> None:
-    """An example that nothing runs, and that breaks unnoticed."""
+    """An example would not be run by any test, and break unnoticed."""
     tested = Path(__file__).read_text()
     assert all(f'"{path.stem}"' in tested for path in EXAMPLES.glob("*.py"))
 
@@ -31,7 +31,7 @@ def test_first_rollout(tmp_path, capsys) -> None:
 
 
 def test_own_garment_own_body(tmp_path, capsys) -> None:
-    """Files in centimetres, or a body that is no person, come out elsewhere: here more than 1 cm inside the body."""
+    """Files in centimetres, or a body that is not a person, would be simulated wrongly: over 1 cm inside the body."""
     _run("02_own_garment_own_body", out=tmp_path, frames=4)
     printed = capsys.readouterr().out
     assert float(printed.split("deepest penetration ")[1].split(" mm")[0]) < 10

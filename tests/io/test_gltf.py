@@ -117,17 +117,18 @@ def test_interpolations(tmp_path, kind):
 
 
 @pytest.mark.parametrize(("keys", "fps"), [(30, 30), (24, 24), (60, 60), (120, 120)])
-def test_keyframes_are_frames(tmp_path, keys, fps):
-    """Baked animations would be resampled, or lose their last frame."""
+@pytest.mark.parametrize("first", [0, 1001])
+def test_keyframes_are_frames(tmp_path, keys, fps, first):
+    """Baked animations would be resampled, lose their last frame, or begin at 0."""
     writer = Writer()
     meshes = [{"primitives": [writer.mesh()]}]
     slide = np.zeros((keys + 1, 3), np.float32)
     slide[:, 2] = np.sin(np.arange(keys + 1))
-    animations = moving(writer, np.arange(keys + 1) / keys, slide, "translation")
+    animations = moving(writer, (first + np.arange(keys + 1)) / keys, slide, "translation")
     writer.write(tmp_path / "m.glb", nodes=[{"mesh": 0}], meshes=meshes, animations=animations)
     body = wg.BodyMotion.load(tmp_path / "m.glb")
     assert body.frames == keys + 1
-    assert body.fps == pytest.approx(fps, rel=1e-5)
+    assert (body.fps, body.clock.number) == (fps, first)
     np.testing.assert_allclose(body.vertices[:, 0, 2] - BODY.vertices[0, 2], slide[:, 2], atol=1e-6)
 
 
@@ -341,3 +342,21 @@ def test_a_crowd_of_instances_does_not_fill_memory(tmp_path):
     )
     with pytest.raises(wg.MeshError, match="frames of 10,000 meshes would take"):
         wg.BodyMotion.load(tmp_path / "m.glb")
+
+
+def test_a_fault_of_the_reader_is_no_damage(tmp_path, monkeypatch):
+    """A fault of this package would be told to users as damage of their file, and never be found."""
+    from warpgarment.io.gltf import scene
+
+    path = tmp_path / "m.glb"
+    writer, document = whole()
+    writer.write(path, **document)
+    for fault in (KeyError("x"), IndexError("x"), TypeError("x"), ValueError("x"), AttributeError("x")):
+
+        def broken(*_, fault=fault):
+            raise fault
+
+        monkeypatch.setattr(scene.Scene, "placed", broken)
+        with pytest.raises(type(fault)) as raised:
+            wg.BodyMotion.load(path)
+        assert not isinstance(raised.value, wg.MeshError)

@@ -126,7 +126,10 @@ def test_yaw_turns_the_answer(kind):
 
 @every_kind
 def test_a_batch_is_its_garments_alone(kind):
-    """Garments of one batch would hear each other, or padding. 2e-5 m: float32 sums of other lengths, four frames."""
+    """Garments of one batch would influence each other, or padding would influence them.
+
+    2e-5 m: float32 sums of other lengths, four frames.
+    """
     garments, network = [skirt(), outfit(), skirt()], made(kind)
     together = rollout(network, garments, walk(5))
     for garment, motion in zip(garments, together, strict=True):
@@ -136,7 +139,7 @@ def test_a_batch_is_its_garments_alone(kind):
 @every_kind
 @pytest.mark.parametrize("splits", [1, 3])
 def test_face_splits(kind, splits):
-    """A kind would be shown parts of garments that it cannot see parts of, or none where it can."""
+    """A kind that needs whole garments would get parts of them, or a kind that can take parts would not."""
     packed = PackedGarments.pack([skirt()], CPU)
     layout = made(kind).layout([skirt()], packed, face_splits=splits)
     rows = sum(len(view.face_index) for view in layout.views)
@@ -162,9 +165,10 @@ def test_a_training_step(kind, splits, tmp_path):
 @every_kind
 @pytest.mark.parametrize("number", [1, 6])
 def test_memory_is_within_its_forecast(kind, number):
-    """A batch would be refused that fits, or taken that does not. Within 1.5 of torch's own count, as all of memory.py.
+    """A batch that fits would be refused, or one that does not fit accepted.
 
-    Of the layout and one call of the network, on garments of 768 faces with made-up distances.
+    Factor 1.5 of torch's count, as in memory.py. Of the layout and one call of the network, on garments of 768 faces
+    with made-up distances.
     """
     config = dataclasses.replace(next(iter(architecture(kind).presets.values())), layers=1)
     network, garments = build_network(config).eval(), []

@@ -1,4 +1,4 @@
-"""What a checkpoint says about itself is checked before memory is asked for."""
+"""The metadata of a checkpoint are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def file(tmp_path):
 
 
 def say(path, key, value):
-    """Puts a text in the metadata of a file whose tensors stay as they are."""
+    """Writes a text to the metadata of a file; its tensors do not change."""
     raw = path.read_bytes()
     length = struct.unpack("<Q", raw[:8])[0]
     header = json.loads(raw[8 : 8 + length])

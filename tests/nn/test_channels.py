@@ -1,4 +1,4 @@
-"""Networks that read some of the feature channels: what they leave out, and what their files say."""
+"""Networks that read only some of the feature channels, and the channels in their checkpoints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of networks: what wins, what is fetched from the Hugging Face Hub, and what is said where there is nothing."""
+"""Names of networks: their order of precedence, downloads from the Hugging Face Hub, and errors for unknown names."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_repositories_that_are_not_there(server, nothing_here):
 
 
 def test_repositories_without_a_network(server, nothing_here):
-    """A repository of pickles would be opened, or the error would speak of a folder nobody has heard of."""
+    """A repository of pickles would be opened, or the error would name a cache folder that the user does not know."""
     (server.root / "ada/pickles/main").mkdir(parents=True)
     (server.root / "ada/pickles/main/pytorch_model.bin").write_bytes(b"x")
     with pytest.raises(CheckpointError, match=r"ada/pickles on the Hugging Face Hub holds no network: .* found none"):

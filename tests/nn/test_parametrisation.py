@@ -24,7 +24,7 @@ def random_features(seed: int = 0) -> torch.Tensor:
 
 
 def random_step(seed: int = 1) -> Step:
-    """Any step."""
+    """A random step."""
     generator = torch.Generator().manual_seed(seed)
     shapes = ((2, 6, 3, 3), (2, 6, 3), (2, 3, 3))
     return Step(*(torch.randn(shape, generator=generator) for shape in shapes))

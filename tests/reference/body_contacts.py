@@ -35,13 +35,63 @@ def body_contacts(
         distance[i] = (-1 if inside else 1) * np.linalg.norm(p - closest)
         if distance[i] >= epsilon[i]:
             continue
-        normal[i] = (p - closest) / distance[i]
-        gap[i] = epsilon[i] - distance[i]
+        normal[i], anchor = (p - closest) / distance[i], closest
+        face = int(np.linalg.norm(points - p, axis=1).argmin())
         if inside and origin is not None:
             met, outward = (a[0] for a in entry(origin[i][None], p[None], *bodies[b]))
             if outward @ normal[i] < 0:  # not where it meets no face: NaN
-                normal[i], gap[i] = outward, epsilon[i] - outward @ (p - met)
+                normal[i], anchor = outward, p - outward @ (p - met) * outward
+                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+                on_plane = np.abs(((met - corners[:, 0]) * normals).sum(1)) / np.linalg.norm(normals, axis=1)
+                face = int((on_plane + np.linalg.norm(_on_triangles(met, corners) - met, axis=1)).argmin())
+        if inside and length_of_way(anchor + 1e-4 * normal[i], normal[i], corners) is not None:
+            way, length = way_out(p, normal[i], corners[face][1] - corners[face][0], corners)
+            if length < 0.05:
+                normal[i], anchor = way, p + length * way
+        room, signs = _crossings(anchor + 1e-4 * normal[i], normal[i], corners)
+        keep = epsilon[i]
+        if len(room) and signs[0] < 0 and room[0] < 2 * keep:
+            keep = min(keep, 0.5 * (room[0] + 1e-4))
+        gap[i] = keep - normal[i] @ (p - anchor)
+        if gap[i] <= 0:
+            normal[i], gap[i] = 0.0, 0.0
     return normal, gap, distance
+
+
+def length_of_way(point: np.ndarray, way: np.ndarray, corners: np.ndarray) -> float | None:
+    """How far a ray goes until it has left a closed body for the first time [m]; None where it starts outside."""
+    far, signs = _crossings(point, way, corners)
+    if signs.sum() < 1:
+        return None
+    return float(far[np.flatnonzero(np.cumsum(signs) == signs.sum())[0]])
+
+
+def way_out(point: np.ndarray, normal: np.ndarray, edge: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, float]:
+    """The shortest of ten ways out and its length [m], infinite where there is none."""
+    one = np.cross(normal, edge)
+    one /= np.linalg.norm(one)
+    other = np.cross(normal, one)
+    ways = [normal, -normal, *(s * x + k * normal for k in (0, 1) for x in (one, other) for s in (1, -1))]
+    ways = [way / np.linalg.norm(way) for way in ways]
+    lengths = [length_of_way(point, way, corners) for way in ways]
+    least = np.argmin([np.inf if length is None else length for length in lengths])
+    return ways[least], np.inf if lengths[least] is None else lengths[least]
+
+
+def _crossings(point: np.ndarray, way: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where a ray meets triangles [m], in order, and +1 for those that it leaves by the front, -1 for the others.
+
+    Tested by the signed volumes that the ray spans with the edges of each triangle.
+    """
+    a, b, c = (corners[:, k] - point for k in range(3))
+    normals = np.cross(b - a, c - a)
+    volumes = np.stack([np.cross(x, y) @ way for x, y in ((a, b), (b, c), (c, a))])
+    along = normals @ way
+    with np.errstate(all="ignore"):
+        far = (a * normals).sum(1) / along
+    met = ((volumes > 0).all(0) | (volumes < 0).all(0)) & (far > 0)
+    order = np.argsort(far[met])
+    return far[met][order], np.sign(along[met][order]).astype(int)
 
 
 def _on_triangles(p: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from benchmarks.frames import FrameCounts, Operators
 from warpgarment.objects.garment import Garment
 from warpgarment.sim import graph
 from warpgarment.sim import simulator as simulator_module
-from warpgarment.sim.recording import Recording
+from warpgarment.sim.results.recording import Recording
 from warpgarment.sim.simulator import Simulator
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

@@ -76,10 +76,11 @@ ONE, MANY = garment(32, 17), [garment(around, 13) for around in (12, 16, 22, 24,
     ],
 )
 def test_prediction(garments, config, options):
-    """A batch would be refused that fits, or taken that does not. Within 1.5 of torch's own count, setting up included.
+    """A batch that fits would be refused, or one that does not fit accepted.
 
-    Geodesic distances and factors lie in NumPy's memory and are counted apart. The last three have too many vertices
-    for a compliance matrix, the last two too many faces for a matrix of all pairs of them.
+    Factor 1.5 of torch's count, set-up included. Geodesic distances and factors lie in NumPy's memory and are counted
+    apart. The last three have too many vertices for a compliance matrix, the last two too many faces for a matrix of
+    all pairs of them.
     """
     motion = walk(2)
     splits = {k: v for k, v in options.items() if k == "face_splits"}

@@ -70,7 +70,7 @@ def frame(device: str) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def frames() -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """On the GPU and on the CPU."""
+    """The stages of a frame on the GPU and on the CPU."""
     return frame(DEVICE), frame("cpu")
 
 

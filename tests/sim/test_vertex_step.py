@@ -1,4 +1,4 @@
-"""Networks that say where vertices are: the simulator takes their positions as the next frame before contact."""
+"""Networks that predict vertices: the simulator takes their positions as the next frame before contact."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def registered(monkeypatch):
 
 
 def drift(kind=Drift) -> GarmentNetwork:
-    """An instance."""
+    """A network of this kind."""
     return kind(NetworkConfig(architecture="drift", **TINY))
 
 
@@ -118,7 +118,7 @@ def test_positions_that_are_not_finite():
 
 
 def test_a_network_that_reads_more_than_there_is():
-    """It would be given None, and fail somewhere inside or learn nothing of it."""
+    """A network would get None for an input that simulations do not have, and fail with an unclear error."""
 
     class Windy(Drift):
         reads = frozenset({"wind", "materials"})

@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from support import meshes
 
-from warpgarment.errors import MissingExtra
+from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.kernels.render import raster, shading
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.motion import GarmentMotion
@@ -173,6 +173,27 @@ def test_contact_sheet_has_a_row_for_each_motion(tmp_path) -> None:
     coral = (picture[..., 0].astype(int) - picture[..., 2]) > 60
     assert coral[:110].sum() > 200
     assert coral[110:].sum() == 0  # the ground truth is drawn in another colour
+
+
+def test_motions_of_other_rates_are_drawn_at_one_moment(tmp_path) -> None:
+    """A body of another rate or start would be drawn elsewhere than its garment. The pictures of the same motion at the
+    garment's rate, exactly where frames coincide; captions say the time."""
+    body, cap = _moving_balls()
+    fine = body.resampled(60.0)
+    slow = BodyMotion(body.vertices[::2], body.faces, 15.0)
+    early = BodyMotion(np.concatenate([body.vertices[:1] - 1] * 3 + [body.vertices]), body.faces, 30.0, start=-0.1)
+    expected = list(draw.film(body, [cap], size=(64, 80)))
+    sheet = draw.contact_sheet(tmp_path / "a.png", body, [cap], frames=3, size=(64, 80))
+    for other in (fine, slow, early):
+        pictures = list(draw.film(other, [cap], size=(64, 80)))
+        assert len(pictures) == 5
+        np.testing.assert_array_equal(pictures, expected)
+        np.testing.assert_array_equal(
+            draw.contact_sheet(tmp_path / "b.png", other, [cap], frames=3, size=(64, 80)), sheet
+        )
+    far = BodyMotion(body.vertices, body.faces, 30.0, start=100.0)
+    with pytest.raises(UsageError, match=r"no frame in common: the body has 5 frames, 3000 to 3004 .*; cap has 5"):
+        next(draw.film(far, [cap]))
 
 
 def test_film_is_read_back_with_all_frames(tmp_path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from benchmarks import report, teacher, teachers_side_by_side
 from warpgarment.training.data import card_page
 from warpgarment.training.evaluate import measure as evaluate
+from warpgarment.training.tables.protocol import FIGURES, skipped_lines
 from warpgarment.training.tables.report import grid, means_table
 from warpgarment.view.markdown import code, escape, table
 
@@ -102,9 +103,32 @@ def test_text_of_others_is_shown_as_text(text):
     shown = html.unescape(re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", escaped))
     assert shown == " ".join("".join(c if c.isprintable() else " " for c in text).split())
     span = code(text)
+    assert "|" not in span  # it would end a cell, also within a span
+    if "|" in text:
+        inside = span.removeprefix("<code>").removesuffix("</code>")
+        assert html.unescape(re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", inside)) == shown
+        return
     fence = re.match("`+", span)[0]
     assert span.endswith(fence)
     assert fence not in re.findall("`+", span[len(fence) : -len(fence)])
+
+
+def test_names_of_others_in_tables_and_evaluations():
+    """A sequence, a category or a reason of a stranger's set would be a tag, or a cell of its own, in a page."""
+    name = "<b>x|y</b> `z`"
+    figures = dict.fromkeys(FIGURES, 1.0) | {"failed": 0, "sequences": 1}
+    rows = [{"label": f"{name}, never seen", "mean": {"cold": {"network": figures}}}]
+    result = {
+        "network": {"file": name}, "settings": {"data": name}, "frames_predicted": 1, "seconds_per_frame": 1.0,
+        "mean": {"cold": {"network": figures}}, "skipped": {name: name},
+        "sequences": [{"sequence": name, "start": "cold", "frames": 1, "network": figures}],
+    }  # fmt: skip
+    for lines in (means_table(rows), skipped_lines({name: name}), evaluate.table(result).splitlines()):
+        assert "x" in "".join(lines)
+        assert "<b>" not in "".join(lines)
+        bare = [line.replace("\\|", "") for line in lines if line.startswith("|")]
+        assert not bare or {line.count("|") for line in bare} <= {bare[0].count("|"), bare[-1].count("|")}
+        assert not any("x|y" in line for line in lines)
 
 
 def test_ordinary_names_stay_as_they_are():

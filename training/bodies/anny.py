@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment.errors import MissingExtra
+from warpgarment.errors import MeshError, MissingExtra
 from warpgarment.io.disk.cache import cache_folder
-from warpgarment.io.npz import write_npz
+from warpgarment.io.npz import read_npz, write_npz
 from warpgarment.training.meshes.cutting import averaging, boundary_loops, compacted, without_short_edges
 
 TEMPLATE_FACES = 6000
@@ -31,6 +30,10 @@ _TEMPLATE = (
     "faces", "corners", "barycentric", "hole_loops", "hole_lengths", "bone_indices", "bone_weights", "bone_names",
     "bone_parents",
 )  # fmt: skip
+_SAVED = {  # of a body in a file: kinds of numbers, and the shape, where a letter is the same size throughout
+    "vertices": ("f", "V3"), "faces": ("iu", "F3"), "joints": ("f", "B3"), "bone_names": ("U", "B"),
+    "bone_parents": ("iu", "B"), "bone_indices": ("iu", "VK"), "bone_weights": ("f", "VK"), "phenotype": ("f", "P"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -73,19 +76,25 @@ class RestBody:
 
     @classmethod
     def load(cls, path: str | Path) -> RestBody:
-        """Reads a body from the .npz file that :meth:`save` wrote."""
-        with np.load(path, allow_pickle=False) as data:
-            phenotype = zip(PHENOTYPES, data["phenotype"].tolist(), strict=True)
-            return cls(
-                vertices=data["vertices"].astype(np.float64),
-                faces=data["faces"],
-                joints=data["joints"].astype(np.float64),
-                bone_names=tuple(str(n) for n in data["bone_names"]),
-                bone_parents=tuple(int(p) for p in data["bone_parents"]),
-                bone_indices=data["bone_indices"],
-                bone_weights=data["bone_weights"],
-                phenotype={name: value for name, value in phenotype if np.isfinite(value)},
-            )
+        """Reads a body from the .npz file that :meth:`save` wrote.
+
+        Raises:
+            MeshError: An array is missing, of another type or shape, not finite, or names bones or vertices that there
+                are not.
+        """
+        data = read_npz(Path(path), tuple(_SAVED), _SAVED.__contains__)
+        _check_saved(path, data)
+        phenotype = zip(PHENOTYPES, data["phenotype"].tolist(), strict=True)
+        return cls(
+            vertices=data["vertices"].astype(np.float64),
+            faces=data["faces"],
+            joints=data["joints"].astype(np.float64),
+            bone_names=tuple(str(n) for n in data["bone_names"]),
+            bone_parents=tuple(int(p) for p in data["bone_parents"]),
+            bone_indices=data["bone_indices"],
+            bone_weights=data["bone_weights"],
+            phenotype={name: value for name, value in phenotype if np.isfinite(value)},
+        )
 
     def bone(self, name: str) -> int:
         """Index of a bone by its name."""
@@ -206,10 +215,24 @@ def anny_bodies() -> AnnyBodies:
 def _read_template(cache: Path) -> dict[str, np.ndarray] | None:
     """The template from its cache; None where there is none, or it is not what was written (zip's CRCs)."""
     try:
-        with np.load(cache, allow_pickle=False) as data:
-            return {key: data[key] for key in _TEMPLATE}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+        return {key: array for key, array in read_npz(cache, _TEMPLATE).items() if key in _TEMPLATE}
+    except (OSError, MeshError):
         return None
+
+
+def _check_saved(path: str | Path, data: dict[str, np.ndarray]) -> None:
+    """Raises MeshError unless the arrays of a saved body have their types and shapes, and indices are in range."""
+    sizes: dict[str, int] = {}
+    for name, (kinds, shape) in _SAVED.items():
+        array = data[name]
+        fits = array.dtype.kind in kinds and array.ndim == len(shape)
+        if not fits or any(sizes.setdefault(s, n) != n for s, n in zip(shape, array.shape, strict=True)):
+            raise MeshError(f"{path}: {name} is {array.dtype} {list(array.shape)}, which does not fit a body.")
+    bounds = (("faces", "V", 0), ("bone_indices", "B", 0), ("bone_parents", "B", -1))
+    wrong = [name for name, size, low in bounds if ((data[name] < low) | (data[name] >= sizes[size])).any()]
+    wrong += [name for name in ("vertices", "joints", "bone_weights") if not np.isfinite(data[name]).all()]
+    if wrong or sizes["3"] != 3 or len(data["phenotype"]) != len(PHENOTYPES):
+        raise MeshError(f"{path}: {(wrong or ['phenotype'])[0]} holds numbers that no body has. It is damaged.")
 
 
 def _build_template() -> dict[str, np.ndarray]:

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from warpgarment.io.disk.atomic import atomic_file, atomic_folder
+from warpgarment.io.disk.atomic import atomic_file, atomic_folder, check_replaceable
+from warpgarment.io.disk.outputs import check_writable
 
 from .card_facts import Facts, Values
 from .card_page import page
@@ -63,10 +64,14 @@ def write_card(
     Raises:
         FileNotFoundError: There is no such folder.
         EmptyDataset: The folder holds no good sequence.
+        OutputError, FileExistsError: The page cannot be written to `out`, or a folder `card` holds something else.
         MissingExtra: The extra for pictures is not installed (`pip install "warpgarment[view]"`).
     """
     root = Path(root)
     out = root if out is None else Path(out)
+    check_writable(out / "card.md")
+    check_writable(out / "card", folder=True)
+    check_replaceable(out / "card", "*.png")
     facts = Facts.of(root)
     if not facts.good:
         raise EmptyDataset(f"{root} holds no good sequence. Make some with `warpgarment generate --out {root}`.")

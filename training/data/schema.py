@@ -1,4 +1,4 @@
-"""What the entries of `manifest.json` and `set.json` may be, and the faults of one that is otherwise."""
+"""The kinds of values that entries of `manifest.json` and `set.json` may have, and the check of a manifest."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 from .layout import SPLITS
 
 MOST_FRAMES = 10_000_000
-MOST_PLANNED = 1_000_000  # sequences of a set
+MOST_PLANNED = 1_000_000  # most sequences of a set
 _LARGEST = 1 << 63
 _FILE = re.compile(r"\w[\w.-]{0,120}", re.ASCII)
 
 
 class Kind(NamedTuple):
-    """Kind of an entry: `fits` tells whether a value is of it, `what` describes it in an error."""
+    """Kind of an entry: `fits` decides whether a value is of this kind, `what` describes it in an error."""
 
     what: str
     fits: Callable[[Any], bool]
@@ -80,7 +80,7 @@ _SEED = Kind("a whole number", _whole(-_LARGEST, _LARGEST))
 _OBJECT = Kind("an object", lambda v: isinstance(v, dict))
 _VERSIONS = Kind("an object of texts", _versions)
 
-ATTEMPT: Mapping[str, Kind] = {  # of a rejected attempt, and of every manifest
+ATTEMPT: Mapping[str, Kind] = {  # entries of a rejected attempt, which every manifest may have
     "status": Kind('"good" or "rejected"', lambda v: v in ("good", "rejected")),
     "reason": _MAYBE_TEXT,
     "split": Kind(f"one of {', '.join(SPLITS)}", lambda v: isinstance(v, str) and v in SPLITS),
@@ -123,7 +123,7 @@ SET: Mapping[str, Kind] = {
 
 
 def faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> dict[str, str]:
-    """Entries of another kind than they may be: name -> what it should be. Absent ones are no fault."""
+    """Entries that are not of their kind: name -> description of the fault. A missing entry is not a fault."""
     return {
         key: f"says {shown(manifest[key])} for {key}, which must be {kind.what}"
         for key, kind in kinds.items()

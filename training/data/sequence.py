@@ -23,6 +23,7 @@ from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.disk.atomic import atomic_folder
 from warpgarment.io.disk.plain import open_plain
+from warpgarment.io.npz import array_header
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 
@@ -177,8 +178,14 @@ class Sequence:
             vertices = part._array("body_vertices")
         else:
             names = "body_rest_vertices", "bone_indices", "bone_weights", "bone_transforms"
-            vertices = linear_blend_skinning(*map(part._array, names))
-        return BodyMotion(vertices, self._array("body_faces"), self.fps)
+            try:
+                vertices = linear_blend_skinning(*map(part._array, names))
+            except MeshError as error:
+                raise MeshError(f"{self.name}: body: {error}") from None
+        try:
+            return BodyMotion(vertices, self._array("body_faces"), self.fps)
+        except MeshError as error:
+            raise MeshError(f"{self.name}: body: {error}") from None
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays in the form that `write_sequence` takes, so that a sequence of format 1 can be written anew."""
@@ -196,10 +203,10 @@ class Sequence:
 
 
 def read_array(folder: Path, name: str) -> np.ndarray:
-    """One array of a sequence, copied into memory unless it is of those that are large.
+    """One array of a sequence; large ones are memory-mapped, all others copied into memory.
 
     Raises:
-        MeshError: There is none, it is no plain file of one array, or it is larger than such an array may be.
+        MeshError: The file is missing, is not a plain file with one array, or is larger than such an array may be.
     """
     path = Path(folder) / f"{name}.npy"
     try:
@@ -220,13 +227,11 @@ def check_array_file(path: Path) -> None:
     """Checks that a file is a plain one with as many bytes as the array in its header needs; reads no more than that.
 
     Raises:
-        MeshError: It is another kind of file, or has other bytes.
-        OSError, ValueError: It cannot be read, or does not begin as a .npy file.
+        MeshError: It is another kind of file, or has another number of bytes.
+        OSError, ValueError: It cannot be read, or does not begin like a .npy file.
     """
     with open_plain(path) as file:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
+        shape, _, dtype = array_header(file)
         size, needed = path.stat().st_size, file.tell() + dtype.itemsize * math.prod(shape)
     if size != needed and not dtype.hasobject:
         raise MeshError(f"{path} has {size:,} bytes, its header says {needed:,}.")

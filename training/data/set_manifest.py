@@ -105,12 +105,11 @@ def read_checked(path: Path, kinds: Mapping[str, Kind] | None) -> dict[str, Any]
 
     Args:
         path: The file.
-        kinds: Kinds of the entries, of `schema`; None leaves them unchecked.
+        kinds: Kinds of the entries, from `schema`; None leaves them unchecked.
 
     Raises:
-        MeshError: The file is missing, no plain file, larger or more deeply nested than `io.disk.plain` allows, or
-            not a
-            JSON object, or an entry is of another kind; the error names it.
+        MeshError: The file is missing, is not a plain file, is larger or more deeply nested than `io.disk.plain`
+            allows, or is not a JSON object; or an entry is of another kind, which the message names.
     """
     try:
         content = read_json(path)

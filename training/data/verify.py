@@ -162,7 +162,7 @@ def _manifest_problems(manifest: dict[str, Any]) -> list[str]:
     wrong = faults(manifest, SEQUENCE)
     figures = manifest.get("figures", {})
     if isinstance(figures, dict):
-        wrong.pop("figures", None)  # told below, by name
+        wrong.pop("figures", None)  # reported below with the names of the figures
     problems += [f"{MANIFEST} {fault}" for fault in wrong.values()]
     empty = ["garment", "motion", *(["reason"] if rejected else ["frames", "checksums"])]
     problems += [
@@ -194,10 +194,10 @@ def _file_problems(folder: Path, manifest: dict[str, Any]) -> list[str]:
 
 
 def _sha256(path: Path) -> str:
-    """Checksum of a file, read in pieces; "" for an array whose header speaks of another number of bytes.
+    """Checksum of a file, read in pieces; "" for an array whose file has another number of bytes than its header says.
 
     Raises:
-        MeshError: It is no plain file.
+        MeshError: It is not a plain file.
         OSError: It cannot be read.
     """
     with open_plain(path) as file:

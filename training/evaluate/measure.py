@@ -41,6 +41,7 @@ from warpgarment.training.tables.protocol import (
 )
 from warpgarment.training.tables.report import grid
 from warpgarment.training.train.training_set import folders_of
+from warpgarment.view.markdown import code, escape
 
 
 class NoTestData(ValueError):
@@ -163,7 +164,7 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         "# Evaluation",
         "",
-        f"Network `{result['network']['file']}`, data `{result['settings']['data']}`: "
+        f"Network {code(result['network']['file'])}, data {code(result['settings']['data'])}: "
         f"{result['frames_predicted']:,} predicted frames, {1000 * result['seconds_per_frame']:.0f} ms each.",
         "",
         "Warm: from ten recorded frames; cold: from the first alone. Only predicted frames count. Chamfer and "
@@ -179,7 +180,7 @@ def table(result: dict[str, Any]) -> str:
     for row in result["sequences"]:
         for method in METHODS:
             if method in row:
-                rows.append([row["sequence"], row["start"], str(row["frames"]), method, *cells(row[method])])
+                rows.append([escape(row["sequence"]), row["start"], str(row["frames"]), method, *cells(row[method])])
     lines += [*grid(["sequence", "start", "frames", "method", *headings], rows), ""]
     lines += skipped_lines(result["skipped"])
     return "\n".join(lines).rstrip() + "\n"

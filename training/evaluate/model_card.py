@@ -10,7 +10,6 @@ The page, `card.md` with `card/*.png`, describes the network, the data, the trai
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,18 @@ from typing import Any
 
 import numpy as np
 
+from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_file, atomic_folder
+from warpgarment.io.disk.plain import below, parsed_json, read_json, read_plain
 from warpgarment.nn import checkpoint
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.card_facts import Facts
+from warpgarment.training.data.schema import is_finite
 from warpgarment.training.data.sequence import Sequence as SequenceOnDisk
 from warpgarment.training.rollouts import predict
+from warpgarment.training.tables.protocol import METHODS
+from warpgarment.training.train.log import LOG_LARGEST
 
 from .model_card_cases import Case, Drawn
 from .model_card_page import page, ratio
@@ -108,9 +112,17 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
         CardError: The result is of another network, or damaged.
     """
     try:
-        result = json.loads(Path(path).read_text("utf-8"))
+        result = read_json(path)
         about, mean = result["network"], result["mean"]
+        _objects(about, mean, result.get("settings", {}), result.get("skipped") or {})
+        _objects(about.get("config") or {}, *mean.values())
+        for row in (row for start in mean.values() for row in start.values()):
+            _check_figures(row)
+        if not isinstance(result.get("frames_predicted", 0), int):
+            raise ValueError("a number of frames that is none")
         rows = [row for row in result["sequences"] if row["start"] == "cold" and row["network"] is not None]
+        for row in rows:
+            _check_row(row)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CardError(f"{path}: no result of an evaluation ({type(error).__name__}: {error})") from error
     # A setting that was introduced later has its default value in older files.
@@ -124,14 +136,37 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
     return result
 
 
+def _objects(*parts: object) -> None:
+    """Raises TypeError unless all are JSON objects."""
+    if not all(isinstance(part, dict) for part in parts):
+        raise TypeError("a list, a text or a number in place of an object")
+
+
+def _check_figures(figures: object) -> None:
+    """Raises ValueError unless these are numbers by name."""
+    if not isinstance(figures, dict) or not all(v is None or isinstance(v, (int, float)) for v in figures.values()):
+        raise ValueError("figures that are no numbers")
+
+
+def _check_row(row: Mapping[str, Any]) -> None:
+    """Raises ValueError where a row of an evaluation holds something else than the page shows."""
+    for method in METHODS:
+        _check_figures(row.get(method, {}))
+    error = row["network"].get("mean_vertex_error_cm")
+    if not isinstance(row["sequence"], str) or not isinstance(row["frames"], int):
+        raise ValueError("a row that does not name its sequence, or number its frames")
+    if error is not None and not is_finite(error):
+        raise ValueError(f"the error of {row['sequence'][:60]!r} is no number")
+
+
 def read_log(path: Path) -> list[dict[str, Any]]:
     """Lines of a training log by step. Of lines that a resumed run wrote again, the later ones count; a torn line is
     left out."""
     entries: dict[tuple[int, bool], dict[str, Any]] = {}
-    for line in path.read_text("utf-8").splitlines():
+    for line in read_plain(path, LOG_LARGEST).decode("utf-8", errors="replace").splitlines():
         try:
-            entry = json.loads(line)
-        except ValueError:
+            entry = parsed_json(path, line)
+        except MeshError:
             continue
         if isinstance(entry, dict) and isinstance(entry.get("step"), int):
             for kind in ("loss", "rollout_error_cm"):
@@ -179,7 +214,7 @@ def largest(errors: np.ndarray, count: int, apart: int) -> list[int]:
 
 def _draw(path: Path, case: Case, config: ModelCardConfig, simulator: Simulator) -> Drawn:
     """Rolls a sequence out again, as in the evaluation, and draws it."""
-    folder = Path(config.data) / str(case.row["sequence"])
+    folder = below(config.data, case.row["sequence"], f"{config.evaluation}: a sequence")
     if not folder.is_dir():
         raise CardError(
             f"{config.data}: has no sequence {folder.name}, which was evaluated. Name the data of that time."

@@ -49,7 +49,7 @@ def page(
     return (
         "\n".join(
             [
-                f"# {name.removesuffix('.safetensors')}",
+                f"# {escape(name.removesuffix('.safetensors'))}",
                 "",
                 f"{network.parameter_count():,} parameters.",
                 "",
@@ -62,7 +62,7 @@ def page(
                 *_training(notes, log),
                 "## Figures",
                 "",
-                *_figures(evaluation),
+                *figures(evaluation),
                 "## Where it fails",
                 "",
                 *_cases(evaluation["sequences"], drawn, rule),
@@ -95,7 +95,7 @@ def _data(notes: Mapping[str, Any], facts: Facts) -> list[str]:
 
 def _training(notes: Mapping[str, Any], log: Sequence[Mapping[str, Any]]) -> list[str]:
     settings = notes.get("training")
-    rows = [[key, _plainly(value)] for key, value in notes.items() if key not in ("training", "data")]
+    rows = [[escape(k), escape(_plainly(value))] for k, value in notes.items() if k not in ("training", "data")]
     lines = table(["budget", "value"], rows) if rows else ["The checkpoint has no notes.", ""]
     if isinstance(settings, Mapping):
         lines += [
@@ -111,11 +111,12 @@ def _training(notes: Mapping[str, Any], log: Sequence[Mapping[str, Any]]) -> lis
     return lines
 
 
-def _figures(evaluation: Mapping[str, Any]) -> list[str]:
+def figures(evaluation: Mapping[str, Any]) -> list[str]:
+    """The tables of an evaluation, of which names and reasons are shown as text."""
     settings, mean, rows = evaluation.get("settings", {}), evaluation["mean"], evaluation["sequences"]
     starts = [start for start in STARTS if start in mean]
     lines = [
-        f"`warpgarment evaluate` on the {settings.get('split', 'test')} split, "
+        f"`warpgarment evaluate` on the {escape(settings.get('split', 'test'))} split, "
         f"{evaluation.get('frames_predicted', 0):,} predicted frames. "
         + "; ".join(f"{start}: {_STARTS[start]}" for start in starts)
         + ". Means over the sequences whose rollout stayed finite; deepest: of all frames.",
@@ -125,7 +126,7 @@ def _figures(evaluation: Mapping[str, Any]) -> list[str]:
     body = [
         [
             start,
-            method,
+            escape(method),
             *map(_cell, [figures] * len(FIGURES), FIGURES),
             figures.get("sequences", ""),
             figures.get("failed", ""),
@@ -140,10 +141,11 @@ def _figures(evaluation: Mapping[str, Any]) -> list[str]:
         for start in starts:
             here = [r for r in rows if r["start"] == start and str(r.get("category") or "-") == category]
             means = [_mean(row[method].get(_ERROR) for row in here if method in row) for method in methods]
-            body += [[category, start, len(here), *means]] if here else []
+            body += [[escape(category), start, len(here), *means]] if here else []
     lines += table(["category", "start", "sequences", *methods], body)
     skipped = evaluation.get("skipped") or {}
-    return lines + ([f"Not evaluated: {'; '.join(f'{k} ({v})' for k, v in skipped.items())}.", ""] if skipped else [])
+    told = "; ".join(escape(f"{name} ({reason})") for name, reason in skipped.items())
+    return lines + ([f"Not evaluated: {told}.", ""] if skipped else [])
 
 
 def _cases(rows: Sequence[Mapping[str, Any]], drawn: Sequence[Drawn], rule: str) -> list[str]:

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from warpgarment.objects.material import Material
+from warpgarment.training.data.schema import MOST_FRAMES, MOST_PLANNED
 from warpgarment.training.data.splits import split_of_clips, split_of_number
 from warpgarment.training.garments.outfits import OutfitPattern, sampled_outfit
 from warpgarment.training.garments.pattern import CATEGORIES, sampled_pattern
@@ -43,30 +44,30 @@ class GenerateConfig:
 
     Attributes:
         out: Folder of the data set.
-        recipe: What it consists of.
-        sequences: How many to make; 240 of `cloth3d` is the standard set.
-        frames: Frames of motion per sequence, after 30 that blend in from the rest pose.
-        faces: Faces of a T-shirt; other categories scale with their area.
-        categories: Garments of `cloth3d`, in turn.
-        held_out: Categories that are only tested on.
-        motions: Folder of BVH and AMASS clips; without one, motions are procedural.
-        procedural_share: Share of procedural motions among the training sequences where there are clips.
-        bodies: "anny" samples Anny's shapes (extra `bodies`); "bundled" uses the one body that ships.
-        teacher: What simulates.
-        materials: "fixed" gives every garment the same cloth, "sampled" its own; None: as the recipe has it.
-        wind: Whether the air moves; None: as the recipe has it.
-        seed: Of the whole set.
-        attempts: How often a sequence that the gate rejects is drawn anew.
-        least_frames: A sequence that fails later than this is kept up to the failure.
+        recipe: Kind of set: "cloth3d" has single garments, "layers" outfits in wind, "seams" a dress with random cuts.
+        sequences: Number of sequences; the standard set is 240 of `cloth3d`.
+        frames: Number of frames of motion per sequence, after 30 frames that blend in from the rest pose.
+        faces: Number of faces of a T-shirt; other categories have more or fewer, by their area.
+        categories: Categories of `cloth3d`, which take turns.
+        held_out: Categories that are only in the test split.
+        motions: Folder of BVH and AMASS clips; None for procedural motions alone.
+        procedural_share: Share of procedural motions among the training sequences, if there are clips.
+        bodies: "anny" samples Anny's shapes (extra `bodies`); "bundled" uses the one body of this package.
+        teacher: Physics solver that simulates the sequences.
+        materials: "fixed" gives all garments the same cloth, "sampled" each its own; None for the recipe's default.
+        wind: Whether there is wind, in about half of the sequences; None for the recipe's default.
+        seed: Seed of the whole set.
+        attempts: Largest number of attempts at a sequence, of which the quality gate may reject some.
+        least_frames: Number of good frames; a sequence that fails after more of them is kept up to the failure.
         first: Number of the first sequence to make.
-        shard: "i/n": make only the sequences whose number is i modulo n, for n machines.
-        workers: Processes.
-        worlds: Sequences simulated at once by each process, on a GPU.
+        shard: "i/n" makes only the sequences whose number is i modulo n, for n machines.
+        workers: Number of processes.
+        worlds: Number of sequences that each process simulates at once, on a GPU.
         device: Warp device of the teacher.
-        ray: Run on a Ray cluster: its address, or "local" for one on this machine (extra `cluster`).
-        attempt: Make this attempt only, to reproduce a rejection.
-        keep_rejected: Write the frames of rejected sequences too.
-        make_blender: First make the virtual environment that the Blender teacher needs.
+        ray: Address of a Ray cluster to run on, or "local" for one on this machine (extra `cluster`).
+        attempt: Number of the only attempt to make, to reproduce a rejection; None for all.
+        keep_rejected: Whether the frames of rejected sequences are written too.
+        make_blender: Whether to make the virtual environment of the Blender teacher first.
     """
 
     out: Path
@@ -108,6 +109,11 @@ class GenerateConfig:
         for name in ("sequences", "frames", "faces", "attempts", "workers", "worlds"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if not 0 <= self.first <= MOST_PLANNED or self.sequences > MOST_PLANNED or self.frames > MOST_FRAMES:
+            raise ConfigurationError(
+                f"{self.sequences:,} sequences of {self.frames:,} frames, from number {self.first:,}: there are at "
+                f"most {MOST_PLANNED:,} in a set, of {MOST_FRAMES:,} frames, numbered from 0."
+            )
         if self.motions is not None and not list_clips(Path(self.motions)):
             raise FileNotFoundError(f"no .bvh or .npz clips in {self.motions}")
 

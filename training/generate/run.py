@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from warpgarment.io.disk.outputs import check_space, check_writable
 from warpgarment.objects.garment import Garment
 from warpgarment.training.data.sequence import MANIFEST, write_sequence
 from warpgarment.training.data.set_manifest import package_versions, write_set_manifest
@@ -29,6 +30,8 @@ from warpgarment.training.teachers import ClothScene, Teacher, TeacherError, mak
 from .placement import body_motion, clothed
 from .quality import Limits, QualityGate
 from .recipes import BLEND, FPS, GenerateConfig, Plan, plan_sequence
+
+BYTES_OF_FACE, BYTES_OF_BODY = 3.2, 600.0  # about, of a frame: half a vertex in 6 bytes, and 31 bones
 
 
 @dataclass
@@ -200,6 +203,8 @@ def generate(config: GenerateConfig) -> Path:
     Raises:
         DatasetMismatch: The folder holds a set made with other options.
         TeacherError: Sequences failed; the message has their number and the reason.
+        OutputError: The folder cannot be written to, or the disk has no room for the sequences.
+        UsageError: There is no such device.
     """
     from tqdm import tqdm
 
@@ -207,17 +212,19 @@ def generate(config: GenerateConfig) -> Path:
     from .workers import spread
 
     config = replace(config, out=Path(config.out), motions=Path(config.motions) if config.motions else None)
+    check_writable(config.out, folder=True)
+    numbers, planned = numbers_to_make(config), range(config.first, config.first + config.sequences)
+    check_space(config.out, len(numbers) * config.frames * (BYTES_OF_FACE * config.faces + BYTES_OF_BODY))
     if config.make_blender:
         from warpgarment.training.teachers.blender.environment import make_environment
 
         make_environment()
+    teacher = make_teacher(config.teacher, "cpu" if config.ray else config.device)  # raises errors before any work
     if config.bodies == "anny":
         from warpgarment.training.bodies.anny import anny_bodies
 
         anny_bodies()  # builds the cache once, before the workers start
-    teacher = make_teacher(config.teacher, config.device)  # raises errors about missing packages before any work
     config.out.mkdir(parents=True, exist_ok=True)
-    numbers, planned = numbers_to_make(config), range(config.first, config.first + config.sequences)
     write_set_manifest(config.out, config.determining(), teacher.settings(), numbers=planned, command=config.command())
     batches = [numbers[i : i + config.worlds] for i in range(0, len(numbers), config.worlds)]
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for the workers

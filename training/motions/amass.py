@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.plain import open_plain
-from warpgarment.io.npz import read_npz
+from warpgarment.io.npz import array_header, read_npz
 
 from .clip import Clip, checked_finite, frame_rate
 
@@ -97,9 +97,7 @@ def amass_length(path: str | Path) -> tuple[int, float]:
     rate = _opened(path, ())["rate"]
     try:
         with zipfile.ZipFile(path) as archive, archive.open("poses.npy") as member:
-            version = np.lib.format.read_magic(member)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(member)
+            shape, _, dtype = array_header(member)
     except _UNREADABLE as error:
         raise MeshError(f"{path.name} is not an .npz file of plain arrays ({error}).") from error
     _check_shape(path, shape, dtype)

@@ -17,7 +17,7 @@ def numbers(where: str, value: Any, dimensions: tuple[int, ...] = (1,)) -> np.nd
 
     Args:
         where: The file and the field, for messages.
-        value: What the field holds: an array, a number, or a list of numbers or of such lists.
+        value: Value of the field: an array, a number, or a list of numbers or of such lists.
         dimensions: Numbers of dimensions it may have.
 
     Returns:
@@ -43,7 +43,7 @@ def number(where: str, value: Any) -> float:
 
     Args:
         where: The file and the field, for messages.
-        value: What the field holds.
+        value: Value of the field.
 
     Raises:
         MeshError: It is something else.
@@ -60,7 +60,7 @@ def betas(where: str, value: Any, frames: int) -> np.ndarray:
 
     Args:
         where: The file and the field, for messages.
-        value: What the field holds.
+        value: Value of the field.
         frames: Number of frames T.
 
     Raises:

@@ -43,6 +43,9 @@ def recording(
 ) -> Recording:
     """A recording of animations of garments and of the body under them.
 
+    Files that say at which frame they start are put together by that: the frames that all have are kept. Those that do
+    not say start with the others; so do those that say 0 and have as many frames.
+
     Args:
         garment: File or folder that `BodyMotion.load` reads, or several, innermost first; (file, mesh) names one mesh
             of a USD stage.
@@ -58,27 +61,31 @@ def recording(
         wind: Velocity of the air in each frame [m/s], [T, 3].
 
     Raises:
-        MeshError: Frames, rates, vertices or sizes do not fit each other, or a file is damaged.
+        MeshError: Frames, rates, vertices or sizes do not fit each other, they have no frame in common, or a file is
+            damaged.
         FileNotFoundError: There is no such file.
 
     Warns:
-        UserWarning: A garment has no rest shape of its own.
+        UserWarning: A garment has no rest shape of its own, or frames are left out.
     """
     several = isinstance(garment, (list, tuple)) and not _is_one(garment)
     sources = cast(list[Source], list(cast(Sequence, garment)) if several else [garment])
     rests = [rest] if rest is None or isinstance(rest, (str, os.PathLike)) else list(rest)
     if rest is not None and len(rests) != len(sources):
         raise MeshError(f"{len(rests)} rest shapes for {len(sources)} garments. Give one each.")
-    rates: dict[str, float] = {}
+    rates, starts = dict[str, float](), list[float | None]()
     garments = [
-        _garment(source, still, unit, clean, rates)
+        _garment(source, still, unit, clean, rates, starts)
         for source, still in zip(sources, rests if rest is not None else [None] * len(sources), strict=True)
     ]
-    motion = _body(body, body_unit or unit, rates)
+    motion = _body(body, body_unit or unit, rates, starts)
     rate = _rate(fps, rates)
-    if motion is not None and motion.fps != rate:
-        motion = BodyMotion(motion.vertices, motion.faces, rate)
     names = ", ".join(str(_split(source)[0]) for source in sources)
+    lengths = [len(g.vertices) for g in garments] + ([len(motion)] if motion is not None else [])
+    parts = _in_common(starts, lengths, [g.rest.name for g in garments] + ["body"])
+    garments = [g._replace(vertices=g.vertices[part]) for g, part in zip(garments, parts, strict=False)]
+    if motion is not None and (motion.fps != rate or len(motion) != len(motion.vertices[parts[-1]])):
+        motion = BodyMotion(motion.vertices[parts[-1]], motion.faces, rate)
     made = Recording(tuple(garments), motion, rate, tuple(materials), wind, source=names)
     if motion is not None:
         for one in made.garments:
@@ -101,7 +108,9 @@ def _split(source: Source) -> tuple[Path, str | None]:
     return (Path(source[0]), source[1]) if isinstance(source, tuple) else (Path(source), None)
 
 
-def _read(source: Source, unit: str | None, rates: dict[str, float]) -> tuple[Path, str, MotionData]:
+def _read(
+    source: Source, unit: str | None, rates: dict[str, float], starts: list[float | None]
+) -> tuple[Path, str, MotionData]:
     path, mesh = _split(source)
     data = read_motion(path, unit=unit, mesh=mesh)
     name = mesh.rsplit("/", 1)[-1] if mesh else path.stem
@@ -109,13 +118,19 @@ def _read(source: Source, unit: str | None, rates: dict[str, float]) -> tuple[Pa
         rates[f"{path.name}{f' ({mesh})' if mesh else ''}"] = float(data.fps)
     elif data.step != 1:
         rates[path.name] = FPS / data.step
+    starts.append(data.start if data.seconds is None else data.seconds * (data.fps or FPS))
     return path, name, data
 
 
 def _garment(
-    source: Source, rest: str | os.PathLike | None, unit: str | None, clean: bool, rates: dict[str, float]
+    source: Source,
+    rest: str | os.PathLike | None,
+    unit: str | None,
+    clean: bool,
+    rates: dict[str, float],
+    starts: list[float | None],
 ) -> RecordedGarment:
-    path, name, data = _read(source, unit, rates)
+    path, name, data = _read(source, unit, rates, starts)
     frames, faces = np.asarray(data.vertices), np.asarray(data.faces)
     if rest is None and path.suffix.lower() == ".pc2":
         rest = next(p for p in (path.with_suffix(".obj"), path.with_suffix(".ply")) if p.exists())
@@ -137,13 +152,16 @@ def _garment(
     return recorded_garment(name, np.asarray(still.vertices), others, frames, where=str(path), clean=clean)
 
 
-def _body(body: Source | BodyMotion | None, unit: str | None, rates: dict[str, float]) -> BodyMotion | None:
+def _body(
+    body: Source | BodyMotion | None, unit: str | None, rates: dict[str, float], starts: list[float | None]
+) -> BodyMotion | None:
     if body is None:
         return None
     if isinstance(body, BodyMotion):
         rates["body"] = body.fps
+        starts.append(body.clock.number or None)
         return body
-    path, _, data = _read(body, unit, rates)
+    path, _, data = _read(body, unit, rates, starts)
     try:
         motion = BodyMotion(data.vertices, data.faces, data.fps or FPS)
         return motion if data.collider_faces is None else motion.submesh(data.collider_faces)
@@ -158,6 +176,45 @@ def _rate(fps: float | None, rates: dict[str, float]) -> float:
         listed = ", ".join(f"{name} {rate:g}" for name, rate in rates.items())
         raise MeshError(f"frames per second differ: {listed}. Resample, or say which is right with fps=.")
     return next(iter(rates.values()), FPS)
+
+
+def _in_common(starts: Sequence[float | None], lengths: Sequence[int], names: Sequence[str]) -> list[slice]:
+    """The frames of each file that all have; everything where the files do not differ in when they start.
+
+    A start of 0 counts as not said where all have as many frames, since programs write it when they do not know.
+
+    Args:
+        starts: Number of each file's first frame, None where it does not say.
+        lengths: Numbers of frames.
+        names: For messages.
+    """
+    known = [start for start in starts if start is not None]
+    begins = [min(known, default=0.0) if start is None else start for start in starts]
+    if not known or max(known) - min(known) < 1e-3:
+        return [slice(None)] * len(starts)
+    if len(set(lengths)) == 1 and min(map(abs, known)) < 1e-3:
+        others = [start for start in known if abs(start) >= 1e-3]
+        if max(others) - min(others) < 1e-3:
+            warnings.warn(
+                f"some files start at frame {others[0]:g}, some at 0, with {lengths[0]:,} frames all of them: they are "
+                "put together from their first frames on.",
+                UserWarning,
+                stacklevel=3,
+            )
+            return [slice(None)] * len(starts)
+    first, stop = max(begins), min(b + n for b, n in zip(begins, lengths, strict=True))
+    listed = ", ".join(f"{name} {b:g} to {b + n - 1:g}" for name, b, n in zip(names, begins, lengths, strict=False))
+    if any(abs(first - b - round(first - b)) > 1e-3 for b in begins):
+        raise MeshError(f"the frames of the files lie between each other: {listed}. Resample them to the same times.")
+    count = round(stop - first)
+    if count < 1:
+        raise MeshError(f"the files have no frame in common: {listed}. Are their starts right?")
+    warnings.warn(
+        f"the files start at other frames: {listed}; the {count:,} frames from {first:g} on are kept, which all have.",
+        UserWarning,
+        stacklevel=3,
+    )
+    return [slice(round(first - b), round(first - b) + count) for b in begins]
 
 
 def _check_place(garment: RecordedGarment, body: BodyMotion, names: str) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import check_plain
 
 LARGEST = 1 << 30  # largest file [bytes]; an info.mat has some hundred thousand
 
@@ -28,8 +29,7 @@ def read_mat(path: str | Path, names: Sequence[str], required: Sequence[str] = (
     from scipy.io import loadmat, whosmat
 
     path = Path(path)
-    if path.stat().st_size > LARGEST:
-        raise MeshError(f"{path}: {path.stat().st_size:,} bytes, too many for the description of a sample.")
+    check_plain(path, LARGEST)
     try:
         present = [name for name, _, _ in whosmat(str(path), appendmat=False)]
         data = loadmat(str(path), simplify_cells=True, variable_names=list(names), appendmat=False)

@@ -101,6 +101,8 @@ class Recording:
     def resampled(self, fps: float) -> Recording:
         """The recording at another rate, with positions interpolated linearly in time and without SMPL poses.
 
+        It has as many whole frames as fit: none holds the end, as that would teach cloth to stop there.
+
         Args:
             fps: New frames per second.
 
@@ -110,14 +112,16 @@ class Recording:
         if checked_fps(fps) == self.fps:
             return self
 
+        count = int(np.floor((len(self) - 1) * fps / self.fps + 1e-6)) + 1
+
         def resample(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-            return BodyMotion(vertices, faces, self.fps).resampled(fps).vertices
+            return BodyMotion(vertices, faces, self.fps).resampled(fps, count).vertices
 
         garments = tuple(RecordedGarment(g.rest, resample(g.vertices, g.rest.faces)) for g in self.garments)
-        body = self.body.resampled(fps) if self.body is not None else None
+        body = self.body.resampled(fps, count) if self.body is not None else None
         wind = self.wind
         if wind is not None:
-            time = np.arange(len(garments[0].vertices)) * (self.fps / fps)
+            time = np.arange(count) * (self.fps / fps)
             wind = np.stack([np.interp(time, np.arange(len(wind)), column) for column in wind.T], axis=1)
         return replace(self, garments=garments, body=body, wind=wind, fps=fps, poses=None)
 
@@ -144,7 +148,7 @@ def recorded_garment(
             "they belong to different meshes."
         )
     if clean:
-        rest, faces, went = clean_mesh(rest, faces)
+        rest, faces, went = clean_mesh(rest, faces)[:3]
         kept = np.flatnonzero(went >= 0)[::-1]  # backwards, so that of merged vertices the first one counts
         origin = np.empty(len(rest), dtype=np.int64)
         origin[went[kept]] = kept

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import check_plain, read_plain
 
 from .unpickle_arrays import ArrayMaker, NdarrayToken, PendingDtype, Refusal
 
@@ -79,12 +80,13 @@ def read_pickle(path: str | Path) -> Any:
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
+    check_plain(path)
     size = path.stat().st_size
     if size > LARGEST:
         raise PickleRefused(f"{path}: {size:,} bytes; more than {LARGEST:,} are not read.")
     machine, position = _Machine(SHARE * size + SPARE), 0
     try:
-        for count, (opcode, operand, place) in enumerate(pickletools.genops(BytesIO(path.read_bytes()))):
+        for count, (opcode, operand, place) in enumerate(pickletools.genops(BytesIO(read_plain(path)))):
             position = place or 0
             if count >= OPCODES:
                 raise Refusal(f"more than {OPCODES:,} opcodes")
@@ -97,7 +99,7 @@ def read_pickle(path: str | Path) -> Any:
             f"{path}: {refusal} at byte {position:,} refused. Only plain NumPy arrays, dictionaries, lists, text and "
             "numbers are read; nothing of the file was executed. If you trust it, save it as .npz where it was made."
         ) from None
-    except (ValueError, IndexError, KeyError, TypeError, OverflowError, MemoryError) as error:
+    except (ValueError, IndexError, KeyError, TypeError, OverflowError, MemoryError, SystemError) as error:
         raise PickleRefused(
             f"{path}: not a readable pickle ({type(error).__name__} after byte {position:,}: {str(error)[:200]}). "
             "It is damaged, cut short, or of another kind."

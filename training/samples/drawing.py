@@ -1,6 +1,6 @@
-"""What samples of one step and unrolled ones draw alike, and how the history of both begins.
+"""The random draws and the histories that single-step and unrolled samples have in common.
 
-Every sample of a batch has a stream of random numbers of its own, so that a part of a batch is the same part whoever
+Every sample of a batch has its own stream of random numbers, so a part of a batch does not depend on the process that
 builds it.
 """
 
@@ -18,12 +18,13 @@ Built = TypeVar("Built", covariant=True)
 
 
 class Builder(Protocol[Built]):
-    """What a loader needs of a builder of batches.
+    """The interface of a builder of batches for a loader.
 
     Attributes:
         sequences: Training sequences.
         device: Device of the sequences, and of the batches.
-        subsets: Whether the network may see some of a garment's faces; otherwise it is also shown whole garments.
+        subsets: Whether the network can always be trained on some of a garment's faces. If not, whole garments are
+            built once garments are no longer split.
     """
 
     sequences: list[SequenceData]
@@ -31,7 +32,7 @@ class Builder(Protocol[Built]):
     subsets: bool
 
     def reaches(self, sequence: int, newest: int) -> bool:
-        """Whether the recorded frames that a sample needs follow a frame."""
+        """Whether enough recorded frames follow the frame `newest` of a sequence for a sample."""
 
     def build(
         self,
@@ -45,11 +46,11 @@ class Builder(Protocol[Built]):
 
         Args:
             picks: Sequence index and newest frame of each sample.
-            faces: Number of faces that the network sees at once; None: all.
-            rng: Source of all randomness: sample b draws from the b-th stream it spawns.
-            displacements: Per sample None or [K,V,3] metres, K <= history: an override of the newest K frames, relative
-                to the recorded positions; noise comes on top.
-            part: The samples to build.
+            faces: Number of faces that the network sees at once; None for all.
+            rng: Source of all randomness: sample b draws from the b-th stream that it spawns.
+            displacements: For each sample None, or displacements of the newest K frames from the recorded positions
+                [m], shape [K,V,3] with K <= history; noise is added to them.
+            part: Slice of the samples to build.
         """
 
 
@@ -67,7 +68,7 @@ def part_of(
     displacements: list[np.ndarray | None] | None,
     part: slice,
 ) -> Part:
-    """A part of a batch, each sample with the stream that it has in the whole; arguments as `Builder.build`."""
+    """A part of a batch, each sample with its stream in the whole batch; the arguments are those of `Builder.build`."""
     streams = rng.spawn(len(picks))[part]
     picks = picks[part]
     return Part(picks, streams, displacements[part] if displacements else [None] * len(picks))
@@ -80,7 +81,7 @@ def displacement(
     rng: np.random.Generator,
     override: np.ndarray | None,
 ) -> np.ndarray | None:
-    """[history,V,3] metres: noise plus the override of the newest frames; None where there is neither."""
+    """Displacement of a history [m], shape [history,V,3]: noise plus `override` of the newest frames; or None."""
     delta = sequence.noise.displacement(history, noise, rng)
     if override is not None:
         if delta is None:
@@ -90,10 +91,10 @@ def displacement(
 
 
 class Past(NamedTuple):
-    """Frames of a history; those before the first recorded one repeat it, as a cold start does."""
+    """Frames of a history. Frames before the first recorded one repeat it, as in a cold start."""
 
     frames: torch.Tensor  # int64 [H], oldest first
-    early: int  # number of those before the first
+    early: int  # number of frames before the first recorded one
 
     @classmethod
     def of(cls, newest: int, history: int, device: torch.device) -> Past:
@@ -102,5 +103,5 @@ class Past(NamedTuple):
         return cls(frames, max(history - 1 - newest, 0))
 
     def held(self, delta: np.ndarray) -> np.ndarray:
-        """A displacement [H,V,3] with early frames displaced as the first one is."""
+        """A displacement [H,V,3] in which the early frames have that of the first recorded one."""
         return delta[np.maximum(np.arange(len(self.frames)), self.early)]

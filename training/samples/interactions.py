@@ -1,16 +1,17 @@
-"""What a garment sees of its body, computed once per sequence and kept beside the data.
+"""The body near each face of a garment, computed once per sequence and kept beside the data.
 
-Closest points and signs depend on the recorded garment, not on the network, and slightly moved garments may reuse them
-(`kernels.features.face_features` recomputes the distance from the closest point). So the signed-distance queries, by
-far the dearest part of a training sample, are done once for every frame t in 0..T-2 and stored as one memory-mapped
-array
+Closest points and signs depend on the recorded garment, not on the network, and slightly displaced garments may reuse
+them (`kernels.features.face_features` recomputes the distance from the closest point). So the signed-distance queries,
+the most expensive part of a training sample, run once for every frame t in 0..T-2. Their results are memory-mapped
+arrays
 
-    interaction.npy   float32 [T-1, F, 16]   columns: see channels.py; row t: the body's motion from t to t + 1
-    geodesics.npy     float32 [F, F]         metres, inf across components; garments beyond 10,000 faces have none
+    interaction.npy   float32 [T-1, F, 16]   columns of `kernels.features.channels.INTERACTION`; row t is the body at t
+                                             and its motion from t to t + 1
+    geodesics.npy     float32 [F, F]         metres, inf across components; absent beyond 10,000 faces
 
-in a folder named after the sequence and the checksum of everything that went in (array files, versions). A folder is
-written under another name and renamed when complete, and its manifest holds the checksums of its files: one that was
-damaged since counts as missing.
+in a folder named after the sequence and the checksum of everything they depend on (array files, versions). A folder is
+written under a temporary name and renamed when complete. Its manifest holds the checksums of its files, and a folder
+that does not match them is computed again.
 
     python -m warpgarment.training.samples.interactions DATA [CACHE]        # fills the cache before a training run
 """
@@ -29,6 +30,7 @@ import torch
 
 import warpgarment
 from warpgarment.io.disk.atomic import atomic_folder
+from warpgarment.io.disk.plain import JSON_LARGEST, open_plain, read_plain
 from warpgarment.kernels.deformation.gradients import face_centroids
 from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction
@@ -64,7 +66,7 @@ def key_of(folder: Path) -> str:
         path = Path(folder) / f"{name}.npy"
         digest.update(name.encode())
         digest.update(path.read_bytes() if path.exists() else b"-")
-    for name in _SOURCES_2:  # where there is none, the key is that of format 1
+    for name in _SOURCES_2:  # without these arrays, the key is that of format 1
         path = Path(folder) / f"{name}.npy"
         if path.exists():
             digest.update(name.encode())
@@ -73,14 +75,14 @@ def key_of(folder: Path) -> str:
 
 
 def compute(sequence: RecordedOnBody, device: torch.device | str = "cpu") -> np.ndarray:
-    """Body interaction of every face in every frame but the last.
+    """Computes the interaction of every face with the body in every frame but the last.
 
     Args:
-        sequence: A `dataset.Sequence` (or anything with `.garment`, `.vertices` and `.body()`).
-        device: Where the queries run.
+        sequence: A `data.sequence.Sequence`, or an object with `garment`, `vertices` and `body()`.
+        device: Device on which the queries run.
 
     Returns:
-        float32 [T-1, F, 16], columns as in `INTERACTION`.
+        Interactions, float32 [T-1, F, 16], columns as in `INTERACTION`.
     """
     device = torch.device(device)
     faces = torch.as_tensor(np.ascontiguousarray(sequence.garment.faces), dtype=torch.int32, device=device)
@@ -100,14 +102,14 @@ def compute(sequence: RecordedOnBody, device: torch.device | str = "cpu") -> np.
 
 
 def pack(found: BodyInteraction) -> torch.Tensor:
-    """BodyInteraction of F faces -> [F, 16], without the index of the body face."""
+    """Packs a BodyInteraction of F faces as an array [F, 16], without the index of the body face."""
     return torch.cat(
         [found.closest, found.sign[:, None].to(torch.float32), found.deformation.reshape(-1, 9), found.velocity], dim=1
     )
 
 
 def unpack(rows: torch.Tensor) -> BodyInteraction:
-    """[N, 16] -> BodyInteraction with body face -1 (what the feature kernel needs is all here)."""
+    """Unpacks [N, 16] as a BodyInteraction with body face -1, which the feature kernel does not need."""
     none = torch.full((len(rows),), -1, dtype=torch.int32, device=rows.device)
     closest, sign, deformation, velocity = (rows[:, place] for place in INTERACTION.slices.values())
     return BodyInteraction(
@@ -122,16 +124,17 @@ def unpack(rows: torch.Tensor) -> BodyInteraction:
 def cached(
     sequence: RecordedOnBody, folder: Path, cache: Path, device: torch.device | str = "cpu"
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Loads a sequence's interactions and geodesics from the cache, computing and storing them first where need be.
+    """Loads interactions and geodesics of a sequence from the cache; missing ones are computed and stored first.
 
     Args:
         sequence: The loaded sequence.
-        folder: Where it was loaded from.
-        cache: Cache root; made if missing.
-        device: Where missing values are computed.
+        folder: Folder of the sequence.
+        cache: Root folder of the cache; it is made if missing.
+        device: Device on which missing values are computed.
 
     Returns:
-        Memory maps: interaction float32 [T-1, F, 16] and geodesics float32 [F, F]; None for garments that pool theirs.
+        Memory maps of interactions, float32 [T-1, F, 16], and of geodesic distances [m], float32 [F, F]. The latter are
+        None for garments with pooled distances.
 
     Raises:
         UnusableSequence: The values are not finite.
@@ -140,7 +143,7 @@ def cached(
     place = cache / f"{Path(folder).name}-{key_of(folder)}"
     names = ["interaction.npy"] if sequence.garment.pools else ["interaction.npy", "geodesics.npy"]
     if not _whole(place, names):
-        shutil.rmtree(place, ignore_errors=True)  # so that no process finds it in its way when it has computed
+        shutil.rmtree(place, ignore_errors=True)  # so that the new folder can take its place
         interaction = compute(sequence, device)
         if not np.isfinite(interaction).all():
             raise UnusableSequence("body interaction is not finite (degenerate body faces or NaN in the body motion)")
@@ -156,11 +159,11 @@ def cached(
 
 
 def _manifest(place: Path) -> str:
-    """Text of the manifest of a complete folder: the checksum of each of its arrays' files, headers included."""
+    """Text of the manifest of a complete folder: the CRC-32 of each array file, header included."""
     sums = {}
     for path in sorted(place.glob("*.npy")):
         value = 0
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             while block := file.read(2**20):
                 value = zlib.crc32(block, value)
         sums[path.name] = f"{value:08x}"
@@ -168,16 +171,16 @@ def _manifest(place: Path) -> str:
 
 
 def _whole(place: Path, names: list[str]) -> bool:
-    """Whether a folder has these files, and no bit of it is another than was written."""
+    """Whether a folder has these files, and all its files have the checksums of its manifest."""
     try:
-        manifest = (place / MANIFEST).read_text("utf-8")
+        manifest = read_plain(place / MANIFEST, JSON_LARGEST).decode("utf-8")
         return all((place / name).exists() for name in names) and manifest == _manifest(place)
-    except (OSError, UnicodeDecodeError):
+    except (OSError, ValueError):
         return False
 
 
 def main(arguments: list[str]) -> None:
-    """Fills the cache of a data folder; prints one line per sequence that cannot be used."""
+    """Fills the cache of a data folder; prints the name of each sequence, and the reason if it cannot be used."""
     from warpgarment.training.data.sequence import Sequence, list_sequences
 
     data = Path(arguments[0])

@@ -1,7 +1,7 @@
-"""Which samples make up which step, and the thread that builds them ahead of the training loop.
+"""The samples of each training step, and the thread that builds their batches ahead of the training loop.
 
-Everything about step n follows from (seed, n): the epoch's order, the subsets of faces, the noise. So a resumed run
-sees the same batches as one that never stopped, and how far ahead the thread runs does not matter.
+Everything about step n follows from (seed, n): the order of the epoch, the subsets of faces, the noise. So a resumed
+run has the same batches as an uninterrupted one, and the number of batches built ahead has no influence on them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ Batch = TypeVar("Batch")
 
 
 class Plan:
-    """Which samples make up which batch: every sample once an epoch, batches of garments of similar size.
+    """Divides samples into batches: each sample once per epoch, and garments of similar size in a batch.
 
     Args:
-        sizes: Faces of each sequence's garment.
-        counts: Samples of each sequence.
-        batch_size: Samples per batch.
-        seed: Of the order.
+        sizes: Number of faces of each sequence's garment.
+        counts: Number of samples of each sequence.
+        batch_size: Number of samples per batch.
+        seed: Seed of the order.
     """
 
     def __init__(self, sizes: list[int], counts: list[int], batch_size: int, seed: int) -> None:
@@ -44,7 +44,7 @@ class Plan:
             order = rng.permutation(len(self._samples))
             if len(order) < self.batch_size:
                 order = np.resize(order, self.batch_size)
-            window = 16 * self.batch_size  # sorted by size within a window only, so that company changes
+            window = 16 * self.batch_size  # sorted by size within a window only, so that batches differ between epochs
             parts = np.split(order, range(window, len(order), window))
             by_size = [part[np.argsort(self.sizes[self._samples[part, 0]], kind="stable")] for part in parts]
             order = np.concatenate(by_size)[: self.batches * self.batch_size].reshape(self.batches, self.batch_size)
@@ -53,17 +53,18 @@ class Plan:
 
 
 class Loader(Generic[Batch]):
-    """Builds the batches of steps, in a thread of its own, `depth` ahead.
+    """Builds the batches of training steps in a thread, up to `depth` of them ahead.
 
     Args:
-        builder: Builds a batch.
-        plan: Says which samples.
-        pool: What the network's own rollouts did wrong, mixed in as `share` of the samples.
-        share: Share of samples from the pool, where it has any that fit.
-        splits: Number of subsets that a garment's faces are split into at a step; one of them is used. At 1, a
-            network without `subsets` is shown whole garments, others as much of each as its batch's smallest has.
-        depth: Batches built ahead; 0 builds them when asked, without a thread.
-        part: The samples of each batch that this process trains on.
+        builder: Builder of batches.
+        plan: Samples of each batch.
+        pool: Errors of the network's own rollouts, from which some samples start.
+        share: Share of samples that start from the pool, if it has fitting entries.
+        splits: Function from a step to the number of subsets into which a garment's faces are split; one of them is
+            used. At 1, a network without `subsets` is given whole garments; other networks are given as many faces of
+            each garment as the smallest one of the batch has.
+        depth: Number of batches built ahead; 0 builds them when they are needed, without a thread.
+        part: Slice of the samples of each batch on which this process trains.
     """
 
     def __init__(
@@ -78,11 +79,11 @@ class Loader(Generic[Batch]):
     ) -> None:
         self.builder, self.plan, self.pool, self.share = builder, plan, pool, share
         self.splits, self.depth, self.part = splits, depth, part
-        # A stream of its own: what a batch waits for is not the training step, nor the other way round
+        # A separate stream, so that building a batch does not wait for the training step, nor the step for it
         self._stream = torch.cuda.Stream(builder.device) if builder.device.type == "cuda" else None
 
     def build(self, step: int, *, splits: int | None = None, part: slice | None = None) -> Batch:
-        """The batch of a step; `splits` and `part` override the schedule's and the process's."""
+        """The batch of a step; `splits` and `part` override those of the schedule and of this process."""
         rng = np.random.default_rng((self.plan.seed, 1, step))
         picks = self.plan.picks(step)
         splits = self.splits(step) if splits is None else splits
@@ -125,12 +126,12 @@ class Loader(Generic[Batch]):
 
         def work() -> None:
             try:
-                with torch.cuda.stream(self._stream):  # of None: nothing
+                with torch.cuda.stream(self._stream):  # does nothing for None
                     for step in range(start, stop):
                         batch = self.build(step)
                         if not hand_over((batch, self._stream.record_event() if self._stream else None)):
                             return
-            except BaseException as error:  # raised where the batch is asked for
+            except BaseException as error:  # raised in the thread that takes the batch
                 hand_over(error)
 
         thread = threading.Thread(target=work, name="warpgarment-loader", daemon=True)
@@ -150,7 +151,7 @@ class Loader(Generic[Batch]):
 
 
 def _adopt(batch: Any, built: torch.cuda.Event) -> None:
-    """Makes the current stream wait for a batch of another one, and its memory wait for the current stream."""
+    """Makes the current stream wait for a batch that another stream built, and keeps its memory until it is used."""
     stream = torch.cuda.current_stream(batch.features.device)
     stream.wait_event(built)
     for tensor in torch.utils._pytree.tree_leaves(tuple(batch)):

@@ -1,15 +1,15 @@
-"""Perturbed histories: what a rollout's own errors look like, so that the network learns to undo them.
+"""Perturbations of histories that resemble the errors of a rollout, so that the network learns to undo them.
 
-A garment of V vertices carries a basis of smooth random displacement fields at several scales: white noise on the
+A garment of V vertices has a basis of smooth random displacement fields at several scales: white noise on the
 vertices, smoothed by k applications of the averaging operator (A V)_i = (V_i + mean of the neighbours of i) / 2 and
 scaled to unit RMS. A displacement of the history is
 
     delta_h = amplitude * (sum_j b_j c_hj + white noise + one offset per component),      c_h = c_H + random walk
     backwards in time,
 
-mostly the same in all frames, as a drift is. The amplitude halves from each scale to the next finer one, so every scale
-stretches the cloth about equally; white noise has a 32nd, since a Poisson solve leaves hardly any. Near pins the
-displacement fades out: a rollout does not drift there.
+and changes little from frame to frame, like the drift of a rollout. The amplitude halves from each scale to the next
+finer one, so every scale stretches the cloth about equally. White noise has 1/32 of it, since the result of a Poisson
+solve is smooth. Near pins, where a rollout does not drift, the displacement fades out.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-SMOOTHINGS = (64, 16, 4)  # applications of the averaging operator, coarse to fine
-FIELDS = 12  # random fields per scale
+SMOOTHINGS = (64, 16, 4)  # numbers of applications of the averaging operator, coarse to fine
+FIELDS = 12  # number of random fields per scale
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class NoiseConfig:
     Attributes:
         position: RMS of the coarsest displacement field; finer ones have 1/2, 1/4 and (white) 1/32 of it.
         offset: RMS per axis of the constant displacement of each component.
-        walk: Random-walk step per frame, relative to the displacement's own amplitude.
-        spread: Every sample draws its amplitude log-uniformly from [spread, 1] times the above.
+        walk: Step of the random walk per frame, relative to the amplitude of the displacement.
+        spread: Least factor of `position` and `offset`; each sample draws its factor log-uniformly from [spread, 1].
         clean: Share of samples without perturbation.
         features: Standard deviation sigma_n of the paper's Gaussian noise on the normalised input features.
     """
@@ -45,7 +45,7 @@ class NoiseConfig:
 
 
 def averaging_operator(faces: np.ndarray, vertex_count: int) -> sp.csr_matrix:
-    """Rows: half the vertex itself, half the mean of its neighbours; isolated vertices stay as they are."""
+    """Sparse matrix [V,V] whose rows average a vertex with the mean of its neighbours; isolated vertices are kept."""
     i = np.concatenate([faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()])
     j = np.concatenate([faces[:, [1, 2, 0]].ravel(), faces[:, [0, 1, 2]].ravel()])
     adjacency = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(vertex_count, vertex_count)).tocsr()
@@ -59,10 +59,10 @@ class NoiseBasis:
     """Smooth random fields of one garment.
 
     Args:
-        faces: int32 [F,3].
-        vertex_component: int [V], component of each vertex.
-        pins: Indices of pinned vertices, may be empty.
-        seed: Of the fields.
+        faces: Vertex indices, int32 [F,3].
+        vertex_component: Component of each vertex, int [V].
+        pins: Indices of pinned vertices; may be empty.
+        seed: Seed of the fields.
     """
 
     def __init__(self, faces: np.ndarray, vertex_component: np.ndarray, pins: np.ndarray, seed: int = 0) -> None:
@@ -93,7 +93,7 @@ class NoiseBasis:
             self.fade = (1.0 - near)[:, None].astype(np.float32)
 
     def displacement(self, frames: int, config: NoiseConfig, rng: np.random.Generator) -> np.ndarray | None:
-        """Displacements [frames, V, 3] in metres, oldest frame first; None for a clean sample."""
+        """Draws displacements [m], shape [frames, V, 3], oldest frame first; None for a clean sample."""
         clean, amplitude = rng.random(), config.spread ** rng.random()
         if clean < config.clean or (config.position == 0.0 and config.offset == 0.0):
             return None

@@ -1,10 +1,10 @@
-"""What the network's own rollouts do wrong, as displacements of recorded frames that training samples can start from.
+"""Errors of the network's own rollouts, as displacements of recorded frames from which training samples can start.
 
 A few short rollouts start from recorded history (or cold, from frame 0) at random places of the training set. After k
-steps the newest k frames differ from the recorded ones by what the network did wrong; these differences override the
-newest frames of a sample's history, whose answer then leads back to the recorded motion. The pool is refreshed every
-so many steps; between refreshes it does not change, and it is part of the saved training state, so that resumed runs
-see the same samples. Several processes share the rollouts, and all get all of them.
+steps, the errors of the network are the differences of the newest k frames from the recorded ones. They displace the
+newest frames of a sample's history, and the sample's target leads back to the recorded motion. The pool is refreshed at
+regular intervals; between them it does not change, and it is part of the saved training state, so that resumed runs
+have the same samples. Several processes share the work, and each gets all rollouts.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ class PushforwardConfig:
     """Settings of the pool.
 
     Attributes:
-        share: Share of training samples that start from the pool; 0, the default, switches it off: at the budgets that
-            were tried, it made rollouts worse (benchmarks/results/recipe.md).
+        share: Share of training samples that start from the pool. 0, the default, switches it off: in all experiments
+            so far, it made rollouts worse (benchmarks/results/recipe.md).
         steps: Length of each rollout in frames.
         rollouts: Number of rollouts in the pool.
-        every: Training steps between refreshes; the first comes after as many steps.
+        every: Number of training steps between refreshes, and before the first one.
         cold: Share of rollouts that start cold at frame 0.
-        limit: Frames whose mean displacement exceeds this [m] are dropped: too far off for a one-step answer.
+        limit: Largest mean displacement of a frame [m]. From the first larger one on, frames of a rollout are dropped,
+            since one step cannot lead back from them.
     """
 
     share: float = 0.0
@@ -49,10 +50,10 @@ class Pool:
 
     def __init__(self) -> None:
         self.rollouts: list[tuple[int, int, np.ndarray]] = []
-        self.step = 0  # of the last refresh
+        self.step = 0  # training step of the last refresh
 
     def fitting(self, sizes: np.ndarray, faces: int, *, whole: bool = False) -> list[tuple[int, int]]:
-        """All (rollout, last frame index) whose garment has at least `faces` faces, or `whole` at most."""
+        """All (rollout, index of the last frame) whose garment has at least `faces` faces; at most with `whole`."""
         return [
             (r, k)
             for r, (s, _, displacement) in enumerate(self.rollouts)
@@ -61,12 +62,12 @@ class Pool:
         ]
 
     def entry(self, rollout: int, last: int, history: int = 10) -> tuple[int, int, np.ndarray]:
-        """Sequence, newest frame, and displacements of the newest frames [<=history,V,3], oldest first."""
+        """Sequence, newest frame, and displacements of at most `history` newest frames [m], [K,V,3], oldest first."""
         sequence, first, displacement = self.rollouts[rollout]
         return sequence, first + last, displacement[max(0, last + 1 - history) : last + 1]
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """For saving."""
+        """The pool as tensors, for the saved training state."""
         saved = {}
         for r, (s, first, displacement) in enumerate(self.rollouts):
             saved[f"pool.{r}.displacement"] = torch.from_numpy(np.ascontiguousarray(displacement))
@@ -74,7 +75,7 @@ class Pool:
         return saved
 
     def restore(self, tensors: dict[str, torch.Tensor]) -> None:
-        """From what `tensors` gave."""
+        """Restores the pool from the result of `tensors`."""
         self.rollouts = []
         while f"pool.{len(self.rollouts)}.place" in tensors:
             r = len(self.rollouts)
@@ -84,13 +85,13 @@ class Pool:
     def refresh(
         self, simulator: Simulator, sequences: list, config: PushforwardConfig, rng: np.random.Generator, group: Group
     ) -> float:
-        """Fills the pool anew.
+        """Replaces the pool by new rollouts.
 
         Args:
-            simulator: A `Simulator` around the network as it is now.
-            sequences: `SequenceData`, with their `source` sequences.
-            config: Settings.
-            rng: Chooses the places, the same in all processes.
+            simulator: A simulator with the current network.
+            sequences: Training sequences, `SequenceData`.
+            config: Settings of the pool.
+            rng: Source of the random places, in the same state in all processes.
             group: The processes that share the work.
 
         Returns:
@@ -123,7 +124,7 @@ class Pool:
     def _places(
         sequences: list, config: PushforwardConfig, rng: np.random.Generator, history: int
     ) -> list[tuple[int, int, int, bool]]:
-        """Where rollouts start: sequence, newest recorded frame, steps, and whether from that frame alone."""
+        """Random starts of rollouts: sequence, newest recorded frame, number of steps, whether the start is cold."""
         places = []
         for _ in range(config.rollouts):
             s = int(rng.integers(len(sequences)))

@@ -1,4 +1,4 @@
-"""One sequence, ready to be sampled: everything that does not change from sample to sample, on the device."""
+"""One training sequence on the device, with everything that is the same for all its samples."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ from .noise import NoiseBasis
 
 
 class SequenceData:
-    """One sequence, ready to be sampled: tensors on the device, small things precomputed.
+    """One training sequence as tensors on the device, with precomputed means and interactions.
 
     Args:
-        sequence: A loaded `dataset.Sequence`.
-        folder: Where it lies.
-        cache: Cache root of `interactions`.
-        network: The `NetworkConfig` samples are made for.
-        device: Where samples are built.
+        sequence: The loaded sequence.
+        folder: Folder of the sequence.
+        cache: Root folder of the cache of `interactions`.
+        network: Settings of the network for which samples are made.
+        device: Device on which samples are built.
+
+    Raises:
+        UnusableSequence: The sequence has too few frames, or positions or interactions that are not finite.
     """
 
     def __init__(
@@ -71,7 +74,7 @@ class SequenceData:
 
     @cached_property
     def body(self) -> BodyMotion:
-        """The collider, for rollouts."""
+        """The part of the body with which cloth collides, for rollouts."""
         return self.source.body()
 
     @cached_property
@@ -83,20 +86,20 @@ class SequenceData:
         return garment
 
     def body_frames(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """The collider in some frames: vertices [T,U,3] in metres and faces [G,3]."""
+        """The colliding part of the body in some frames: vertices [m], shape [T,U,3], and faces [G,3]."""
         used, faces = self._collider
         return self.source.body_in(frames).vertices[:, used], faces
 
     @cached_property
     def _collider(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices of the body that colliding faces use [U], and these faces in terms of them [G,3]."""
+        """Indices of the body's vertices that colliding faces use [U], and these faces as indices into them [G,3]."""
         faces = self.source.body_in([0]).faces[self.source.collider_faces]
         used, inverse = np.unique(faces, return_inverse=True)
         return used, inverse.reshape(-1, 3)
 
     @cached_property
     def shown(self) -> Any:
-        """How the garment's faces lie on the cloth, as `Architecture.rows` is given it for samples."""
+        """How the garment's faces lie on the cloth, from `Architecture.sampled`; an argument of `Architecture.rows`."""
         kind = architecture(self._network.architecture)
         return kind.sampled(kind.geometry(self.garment, self._network), self._network, self.device)
 
@@ -114,7 +117,7 @@ class SequenceData:
 
 
 def _writable(array: np.ndarray) -> np.ndarray:
-    """The same memory map, copy-on-write, so that torch takes it without a warning; nothing is read yet."""
+    """The same file mapped copy-on-write, which torch accepts without a warning; nothing is read yet."""
     if isinstance(array, np.memmap) and array.filename is not None:
         return np.load(array.filename, mmap_mode="c")
     return array
@@ -126,7 +129,7 @@ def _components(vertex_count: int, faces: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _mean_weights(faces: np.ndarray, vertex_component: np.ndarray, count: int) -> torch.Tensor:
-    """[C,V] weights whose product with vertices is the mean face centroid of each component."""
+    """Weights [C,V] whose product with vertices is the mean face centroid of each component."""
     weights = np.zeros((count, len(vertex_component)))
     corners = np.asarray(faces).ravel()
     np.add.at(weights, (vertex_component[corners], corners), 1.0)

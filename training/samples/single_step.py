@@ -1,17 +1,15 @@
-"""Training samples: histories of perturbed garments, as the network will meet them in a rollout, and what it should
-answer.
+"""Training samples of single steps: perturbed histories, similar to those of a rollout, and targets.
 
-A sample is a sequence and its newest history frame t; the target is frame t + 1. Frames before the first repeat it,
-with a body at rest, exactly as a cold start does. Garment positions of the history are displaced (by `noise`, or by
-what a rollout of the network itself did wrong), and everything is recomputed from the displaced positions, the answer
-too:
+A sample is a sequence and the newest frame t of a history; the target is frame t + 1. Frames before the first one
+repeat it, with a body at rest, exactly as in a cold start. Garment positions of the history are displaced (by `noise`,
+or by errors of the network in a rollout), and everything is recomputed from the displaced positions, also the target:
 
     Psi = Phi_{t+1} (Phi~_t)^-1      Sigma = Sigma_{t+1}      q = z_{t+1} - z~_t            (~ displaced)
 
-so the answer leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces
-and frames. Its samples have the same number of faces N, a random subset of each garment's, so nothing is padded but
-components. Some networks are to see all faces (`Architecture.subsets`): then whole garments make a batch, padded with
-copies of a face that do not count.
+so the target leads back to the recorded motion. A batch is built with one launch of the feature kernel over all faces
+and frames. Its samples have the same number of faces N, a random subset of each garment's faces, so only components are
+padded. Networks without `Architecture.subsets` are finally trained on whole garments; these are padded with copies of a
+face, which the loss ignores.
 """
 
 from __future__ import annotations
@@ -41,45 +39,44 @@ __all__ = ["Augmentation", "Batch", "SampleBuilder", "SequenceData", "mirror"]
 
 
 class Batch(NamedTuple):
-    """Training samples; lengths in metres, in the network's frame (turned to its heading, mirrored, as the settings
-    say)."""
+    """Training samples in the network's frame, that is turned to its heading and mirrored; lengths in metres."""
 
     features: torch.Tensor  # [B,N,H*34] oldest first
     velocities: torch.Tensor  # [B,C,(H-1)*3]
-    weights: Any  # how the faces lie on the cloth, from `Architecture.rows`; geodesic weights [B,N,N], for one
+    weights: Any  # from `Architecture.rows`, for example geodesic weights [B,N,N]
     velocity_mask: torch.Tensor | None  # [B,C] bool; None where all garments have C components
-    components: torch.Tensor  # scalar: garment components of the whole batch, times the share of it that this is
-    target: NetworkOutput  # what the network should say
-    ids: list[tuple[str, int]]  # sequence, newest frame
+    components: torch.Tensor  # scalar: number of components in the whole batch, times the share of this part of it
+    target: NetworkOutput
+    ids: list[tuple[str, int]]  # name of the sequence, newest frame
     face_mask: torch.Tensor | None = None  # [B,N] bool; None where all are real
-    faces: torch.Tensor | None = None  # scalar, as `components`, of real faces; None where all are
+    faces: torch.Tensor | None = None  # scalar like `components`, for real faces; None where all are real
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
-        """Samples, and operations of a training step on them (`nn/flops.py`)."""
+        """Number of samples, and of operations of a training step on them (`nn/flops.py`)."""
         samples, faces = self.features.shape[:2]
         return samples, work(config, [(samples, faces, self.velocities.shape[1], self.weights)])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What is kept of a batch whose loss is not finite."""
+        """Arrays that are saved if the loss of the batch is not finite."""
         weights = {"weights": self.weights} if isinstance(self.weights, torch.Tensor) else _tensors(self.weights)
         tensors = {"features": self.features, "velocities": self.velocities, **weights, **self.target._asdict()}
         return {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
 
 
 def _tensors(layout: Any) -> dict[str, torch.Tensor]:
-    """The tensors among the fields of a named tuple; none of anything else."""
+    """The tensors among the fields of a named tuple, by name; empty for any other object."""
     fields = layout._asdict() if hasattr(layout, "_asdict") else {}
     return {name: value for name, value in fields.items() if isinstance(value, torch.Tensor)}
 
 
 class SampleBuilder:
-    """Builds batches.
+    """Builds batches of single-step samples.
 
     Args:
         sequences: Training sequences.
-        network: Config of the network that is trained.
+        network: Settings of the network.
         noise: Perturbation of histories.
-        augmentation: Mirror, turns and sizes.
+        augmentation: Mirroring, turns and changes of size.
     """
 
     def __init__(
@@ -92,7 +89,7 @@ class SampleBuilder:
         self.subsets = self.kind.subsets
 
     def reaches(self, sequence: int, newest: int) -> bool:
-        """Whether the recorded frames that a sample needs follow a frame."""
+        """Whether the frame after `newest` is recorded."""
         return newest < self.sequences[sequence].count
 
     @torch.no_grad()
@@ -108,15 +105,15 @@ class SampleBuilder:
 
         Args:
             picks: Sequence index and newest frame of each sample.
-            faces: Number N of faces per sample, a random subset; every garment has as many. For a kind of network
-                without `subsets` also None: all of every garment.
-            rng: All randomness comes from here: sample b draws from the b-th stream it spawns.
-            displacements: Per sample None or [K,V,3] metres, K <= history: an override of the newest K frames, relative
-                to the recorded positions; noise comes on top.
-            part: The samples to build.
+            faces: Number N of faces per sample, a random subset of each garment's, which must have at least as many.
+                None, for a kind of network without `subsets`, takes all faces of every garment.
+            rng: Source of all randomness: sample b draws from the b-th stream that it spawns.
+            displacements: For each sample None, or displacements of the newest K frames from the recorded positions
+                [m], shape [K,V,3] with K <= history; noise is added to them.
+            part: Slice of the samples to build.
 
         Returns:
-            The batch, on the sequences' device.
+            The batch, on the device of the sequences.
         """
         all_faces = sum(len(self.sequences[s].faces) if faces is None else faces for s, _ in picks)
         whole = [self.sequences[s].components for s, _ in picks]
@@ -212,8 +209,8 @@ class SampleBuilder:
     def _drawn(
         self, picks: list[tuple[int, int]], streams: list[np.random.Generator]
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, np.ndarray, np.ndarray]:
-        """Per sample: turn of the world [B,3,3], the same times its scale, the part of the turn that the rest pose
-        shares, whether it is mirrored [B], and its scale [B]."""
+        """Draws for each sample: turn of the world [B,3,3], the turn times the scale, the part of the turn that the
+        rest pose shares, whether the sample is mirrored [B], and its scale [B]."""
         settings, count = self.augmentation, len(picks)
         canonical = self.network.heading == "canonical"
         angles = np.zeros((2, count), np.float32)  # of the world, of world and rest together
@@ -233,7 +230,7 @@ class SampleBuilder:
         return turn, turn * self._send(scale)[:, None, None], joint, mirrored, scale
 
     def _send(self, array: np.ndarray) -> torch.Tensor:
-        """A copy on the device; from pinned memory, so that nothing waits for it."""
+        """Copies an array to the device, from pinned memory, so that the host does not wait."""
         values = torch.from_numpy(np.ascontiguousarray(array))
         if self.device.type != "cuda":
             return values.to(self.device)
@@ -241,6 +238,6 @@ class SampleBuilder:
 
     @staticmethod
     def _turned(rows: torch.Tensor, turn: torch.Tensor, scale: torch.Tensor, origin: torch.Tensor) -> torch.Tensor:
-        """Interactions [B,N,H,16] turned and scaled about each garment's origin [B,1,3]."""
+        """Interactions [B,N,H,16], turned and scaled about the origin of each garment [B,1,3]."""
         flat = INTERACTION.centred(rows.flatten(1, 2), origin)
         return (flat @ INTERACTION.turn(turn, scale=scale).mT).reshape(rows.shape)

@@ -1,4 +1,4 @@
-"""Means and standard deviations that a network normalises its inputs and outputs with."""
+"""Means and standard deviations by which a network normalises its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from warpgarment.nn.network import GarmentNetwork
 
 from .single_step import Batch
 
-FLOORS = {"feature": 3e-3, "velocity": 1e-3, "psi": 1e-3, "singular_value": 1e-3, "q": 3e-4}
+FLOORS = {"feature": 3e-3, "velocity": 1e-3, "psi": 1e-3, "singular_value": 1e-3, "q": 3e-4}  # least deviations
 
 
 def statistics(batches: Iterable[Batch], network: GarmentNetwork) -> dict[str, torch.Tensor]:
     """Means and standard deviations of inputs and targets over some batches.
 
-    Residual outputs keep the means that stand for skin; deviations have floors, so that numbers which hardly vary (a
-    body at rest, a singular value that is always one) are not blown up.
+    Residual outputs keep the means with which a garment moves like skin. Deviations have lower bounds, so that numbers
+    which hardly vary (a body at rest, a singular value that is always one) do not become very large.
     """
     samples: dict[str, list[torch.Tensor]] = {name: [] for name in FLOORS}
     for batch in batches:

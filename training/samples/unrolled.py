@@ -1,8 +1,9 @@
-"""Samples for unrolled training: whole garments on their bodies, K frames to go, as a `Scene` and its first state.
+"""Samples for unrolled training: whole garments on their bodies, as a `Scene` and its first state, for K steps.
 
-A sample is a sequence and its newest history frame t, as in `single_step`; frames t+1..t+K are recorded answers. The
-history is displaced as there, and its features are computed from the displaced positions with cached nearest points.
-Everything stays in world space. Turns and mirrors are kept with the batch: the network sees turned and mirrored inputs.
+A sample is a sequence and the newest frame t of a history, as in `single_step`; frames t+1..t+K are the recorded
+targets. The history is displaced as in `single_step`, and its features are computed from the displaced positions with
+cached nearest points. Positions and features are in world space. The batch holds turns and mirrors, which are applied
+to the inputs of the network.
 """
 
 from __future__ import annotations
@@ -32,31 +33,31 @@ from .recorded import SequenceData
 
 @dataclass(frozen=True)
 class UnrolledBatch:
-    """Unrolled samples, packed; lengths in metres, in world space."""
+    """Samples for unrolled training, packed; lengths in metres, in world space."""
 
     scene: Scene
-    vertices: torch.Tensor  # [V,3] of the newest history frame, displaced
-    history: History  # of the frames before it
-    features: torch.Tensor  # [F,34] of the newest frame
-    bodies: list[torch.Tensor]  # K+1 frames [U,3], of the newest frame first
-    recorded: list[torch.Tensor]  # K frames [V,3]
-    turn: torch.Tensor  # [B,3,3] of what the network sees, the world and the rest pose's together
-    joint: torch.Tensor  # [B,3,3] the part of it that the rest pose shares
+    vertices: torch.Tensor  # [V,3] displaced positions at frame t
+    history: History  # of the frames before t
+    features: torch.Tensor  # [F,34] at frame t
+    bodies: list[torch.Tensor]  # K+1 tensors [U,3], bodies at frames t..t+K
+    recorded: list[torch.Tensor]  # K tensors [V,3], recorded positions at frames t+1..t+K
+    turn: torch.Tensor  # [B,3,3] rotation of the world for the network
+    joint: torch.Tensor  # [B,3,3] the part of that rotation that the rest pose shares
     mirrored: torch.Tensor  # bool [B]
-    face_weight: torch.Tensor  # [F] in a mean over samples of means over faces
-    vertex_weight: torch.Tensor  # [V]
-    components: torch.Tensor  # scalar: as `samples.Batch.components`
-    ids: list[tuple[str, int]]  # sequence, newest frame
+    face_weight: torch.Tensor  # [F] weights whose weighted sum is a mean over samples of means over faces
+    vertex_weight: torch.Tensor  # [V] the corresponding weights of vertices
+    components: torch.Tensor  # scalar, as `single_step.Batch.components`
+    ids: list[tuple[str, int]]  # name of the sequence, newest frame
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
-        """Samples, and operations of a training step on them (`nn/flops.py`)."""
+        """Number of samples, and of operations of a training step on them (`nn/flops.py`)."""
         views = [
             (*view.face_index.shape, view.component_index.shape[1], view.weights) for view in self.scene.layout.views
         ]
         return len(self.ids), len(self.recorded) * work(config, views)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What is kept of a batch whose loss is not finite."""
+        """Arrays that are saved if the loss of the batch is not finite."""
         tensors = {"features": self.history.stacked(self.features), "velocities": self.history.velocities}
         tensors |= {"vertices": self.vertices, "recorded": torch.stack(self.recorded), "faces": self.scene.packed.faces}
         return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
@@ -67,11 +68,11 @@ class UnrolledBuilder:
 
     Args:
         sequences: Training sequences.
-        network: In training; only its settings are read here.
+        network: The network in training; the scenes run it.
         noise: Perturbation of histories.
-        augmentation: Mirror and turns.
-        steps: K.
-        collision_passes: Of the scenes.
+        augmentation: Mirroring and turns.
+        steps: Number of steps K.
+        collision_passes: Largest number of collision refinements in a frame.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class UnrolledBuilder:
         self.steps, self.collision_passes = steps, collision_passes
 
     def reaches(self, sequence: int, newest: int) -> bool:
-        """Whether all K frames after a frame are recorded."""
+        """Whether all K frames after `newest` are recorded."""
         return newest + self.steps < len(self.sequences[sequence].vertices)
 
     @torch.no_grad()
@@ -102,8 +103,8 @@ class UnrolledBuilder:
         displacements: list[np.ndarray | None] | None = None,
         part: slice = slice(None),
     ) -> UnrolledBatch:
-        """Builds one batch, or a part of it; as `SampleBuilder.build`, but that all faces are there, and the network
-        sees them in subsets of about `faces` (None: all at once)."""
+        """Builds one batch, or a part of it, as `SampleBuilder.build`. But the batch has all faces, and the network
+        sees them in subsets of about `faces` faces (None: all at once)."""
         total = sum(self.sequences[s].components for s, _ in picks) / len(picks)
         picks, streams, overrides = part_of(picks, rng, displacements, part)
         history, device = self.network.config.history, self.device
@@ -163,7 +164,7 @@ class UnrolledBuilder:
         )
 
     def _symmetries(self, streams: list[np.random.Generator]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Per sample: turn of what the network sees [B,3,3], the part that the rest pose shares, whether mirrored."""
+        """Draws for each sample: turn of the world [B,3,3], the part that the rest pose shares, mirrored or not."""
         settings = self.augmentation
         free = settings.world_yaw and self.network.config.heading == "world"
         angles, mirrored = np.zeros((2, len(streams)), np.float32), np.zeros(len(streams), bool)
@@ -176,6 +177,6 @@ class UnrolledBuilder:
 
 
 def _means(owner: torch.Tensor, count: int) -> torch.Tensor:
-    """Weights whose sum with values is the mean over garments of means over what each owns."""
+    """Weights whose weighted sum is the mean over garments of means over the elements of each."""
     number = torch.bincount(owner.long(), minlength=count)
     return (1.0 / (count * number))[owner.long()].float()

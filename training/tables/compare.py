@@ -11,6 +11,7 @@ from warpgarment.sim.simulator import Simulator
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.run import NonFiniteLoss
 from warpgarment.training.train.training_set import folders_of
+from warpgarment.view.markdown import escape
 
 from . import recipe, variants
 from .options import DataLacks, OptionMissing
@@ -94,7 +95,9 @@ def make(config: Any) -> dict[str, Any]:
     else:
         body += [*means_table(rows, {"steps": "steps", "hours": "hours"}), "", PAPER[config.table]]
     body += [
-        line for name, reason in diverged.items() for line in ("", f"No row {name}, its training ended: {reason}.")
+        line
+        for name, reason in diverged.items()
+        for line in ("", f"No row {name}, its training ended: {escape(reason)}.")
     ]
     draw = sweeps if config.table == "table2" else bars
     publish(config, result, body, lambda path: draw(path, rows))

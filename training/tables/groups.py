@@ -13,6 +13,7 @@ from warpgarment.training.data.sequence import read_manifest
 from warpgarment.training.data.set_manifest import read_set_manifest
 from warpgarment.training.generate.recipes import TRAINING_CUTS
 from warpgarment.training.train.training_set import folders_of
+from warpgarment.view.markdown import escape
 
 from .options import DataLacks, OptionMissing
 from .pictures import Keeper, bars, results_file, rollouts
@@ -93,7 +94,9 @@ def make(config: Any) -> dict[str, Any]:
         note += f" {OTHERS}"
     body = [note, "", PROTOCOL, "", *means_table(rows, {"count": "sequences"})]
     body += [
-        line for label in left_out for line in ("", f"No row for {label}: none of its sequences can be evaluated.")
+        line
+        for label in left_out
+        for line in ("", f"No row for {escape(label)}: none of its sequences can be evaluated.")
     ]
     if config.picture:
         drawn = results_file(config, f"{config.table}_rollouts.png")

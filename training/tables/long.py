@@ -15,6 +15,7 @@ from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
 from warpgarment.training.train.training_set import folders_of
 from warpgarment.view import draw
+from warpgarment.view.markdown import escape
 
 from .long_rollout import STILL, Limits, extended, figures, judged, settled, vertex_areas, walk
 from .options import DataLacks, OptionMissing
@@ -126,7 +127,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
     values = [form.format(scale * row["verdict"][key]["value"]) for key, (_, scale, form) in HEADINGS.items()]
     broken = [HEADINGS[key][0].split(" [")[0] for key, v in row["verdict"].items() if not v["kept"]]
     verdict = "good" if row["good"] else "not kept: " + ", ".join(broken)
-    return [row["row"], row["start"], *values, f"{100 * row['largest_mean_to_anchor_m']:.1f}", verdict]
+    return [escape(row["row"]), row["start"], *values, f"{100 * row['largest_mean_to_anchor_m']:.1f}", verdict]
 
 
 def _draw(path: Path, rows: list[dict[str, Any]]) -> None:

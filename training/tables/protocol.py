@@ -22,8 +22,9 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
-from warpgarment.training.rollouts import predict, rigid, skinned
+from warpgarment.training.rollouts import check_rate, predict, rigid, skinned
 from warpgarment.training.train.training_set import reason_of
+from warpgarment.view.markdown import escape
 
 METHODS = ("network", "skinned", "rigid")
 STARTS = ("warm", "cold")
@@ -89,6 +90,7 @@ def measure(
         try:
             sequence = Sequence.load(folder)
             body = sequence.body()
+            check_rate(body.fps, simulator.network.config.fps)
             last = min(len(sequence.vertices), body.frames) - 1
             if last < history:
                 raise ValueError(f"{last + 1} frames, fewer than history + 1 = {history + 1}")
@@ -182,7 +184,7 @@ def skipped_lines(skipped: dict[str, str]) -> list[str]:
     if not skipped:
         return []
     count = f"{len(skipped)} sequence{'s' if len(skipped) > 1 else ''} skipped:"
-    return [count, "", *(f"- {name}: {reason}" for name, reason in sorted(skipped.items()))]
+    return [count, "", *(f"- {escape(f'{name}: {reason}')}" for name, reason in sorted(skipped.items()))]
 
 
 def plain(value: Any) -> Any:

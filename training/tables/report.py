@@ -13,7 +13,7 @@ import torch
 
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.training.data.set_manifest import package_versions
-from warpgarment.view.markdown import table
+from warpgarment.view.markdown import code, escape, table
 
 from .options import RESULTS
 from .protocol import FIGURES, STARTS, cells, plain, skipped_lines
@@ -43,7 +43,7 @@ def publish(config: Any, result: dict[str, Any], body: list[str], draw: Callable
     name = result["table"]
     result["command"], result["machine"] = command(config), machine(config.device)
     about = ", ".join(f"{k} {v}" for k, v in result["machine"].items())
-    lines = [f"# {result['title']}", "", f"`{result['command']}`", "", f"{about}.", "", *body]
+    lines = [f"# {result['title']}", "", code(result["command"]), "", f"{about}.", "", *body]
     if draw is not None and config.picture:
         lines += ["", f"![{result['title']}]({name}.png)"]
         with atomic_file(out / f"{name}.png") as temporary:
@@ -79,6 +79,7 @@ def means_table(rows: list[dict[str, Any]], extra: dict[str, str] | None = None)
         for start in STARTS:
             for method, figures in row["mean"].get(start, {}).items():
                 label = row["label"] if method == "network" else f"{row['label']}: {method}" if row["label"] else method
+                label = escape(label)
                 more = [str(row.get(key, "")) if method == "network" else "" for key in extra]
                 failed = f"{figures['failed']} of {figures['sequences']}"
                 lines.append([label, *more, start, *cells(figures), failed])

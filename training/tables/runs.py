@@ -16,7 +16,9 @@ from typing import Any
 
 from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import read_json
 from warpgarment.nn import checkpoint
+from warpgarment.training.data.schema import shown
 from warpgarment.training.data.sequence import read_manifest
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.start import train
@@ -25,6 +27,10 @@ from warpgarment.training.train.training_set import folders_of
 from .settings import described, differences
 
 RECORD = "row.json"
+_KINDS: dict[str, tuple[type, ...]] = {  # of its entries
+    "settings": (dict,), "data": (dict,), "complete": (bool,), "file": (str,), "sha256": (str,), "steps": (int,),
+    "hours": (int, float), "validation": (int, float, str),
+}  # fmt: skip
 
 
 class RunMismatch(ValueError):
@@ -60,7 +66,7 @@ def trained(folder: Path, config: TrainConfig, data: dict[str, Any]) -> Run:
         RunMismatch: The folder holds another run, or the training stopped before its budget was spent.
     """
     wanted = {"settings": described(config), "data": data}
-    record = _read(folder)
+    record = read_record(folder)
     if record is None:
         if folder.is_dir() and any(folder.iterdir()):
             raise RunMismatch(f"{folder} holds files but no {RECORD}: this command did not start it. Give other --runs")
@@ -118,15 +124,21 @@ def _complete(folder: Path, record: dict[str, Any], config: TrainConfig) -> Run:
     return Run(file, record.get("steps"), record.get("hours"), error if isinstance(error, float) else None)
 
 
-def _read(folder: Path) -> dict[str, Any] | None:
+def read_record(folder: Path) -> dict[str, Any] | None:
     try:
-        record = json.loads((folder / RECORD).read_text("utf-8"))
+        record = read_json(folder / RECORD)
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
         raise RunMismatch(f"{folder / RECORD} cannot be read ({error}); remove the folder") from error
     if not isinstance(record, dict):
         raise RunMismatch(f"{folder / RECORD} is not a JSON object; remove the folder")
+    wrong = [key for key, kinds in _KINDS.items() if not isinstance(record.get(key), (*kinds, type(None)))]
+    if wrong or Path(record.get("file") or "network").name != (record.get("file") or "network"):
+        raise RunMismatch(
+            f"{folder / RECORD} says {shown(record.get((wrong or ['file'])[0]))} for {(wrong or ['file'])[0]}; "
+            "remove the folder"
+        )
     return record
 
 

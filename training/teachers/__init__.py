@@ -22,13 +22,13 @@ from warpgarment.objects.material import Material
 
 
 class TeacherEntry(NamedTuple):
-    """What can be said of a teacher without importing it.
+    """Facts about a teacher that are known without an import of it.
 
     Attributes:
-        module: Has `make(device: str | None) -> Teacher`; the device is Warp's, None its default.
-        extra: The extra of this package that brings what it needs; None: something else does, or nothing is needed.
-        packages: Packages of this environment whose versions its results depend on.
-        credit: Whose work it is, and under which licence, after "simulated with".
+        module: Module with a function `make(device: str | None) -> Teacher`; None is Warp's default device.
+        extra: Extra of this package that installs its requirements; None if it needs none.
+        packages: Packages of this environment on whose versions its results depend.
+        credit: Name and licence of the solver, to follow the words "simulated with".
     """
 
     module: str
@@ -51,11 +51,11 @@ class Cloth:
     """One garment of a scene.
 
     Attributes:
-        garment: Rest mesh [m]; its pins are tied to the body's surface, or held in place where there is no body.
-        start: Where its vertices are when the simulation begins [m], float32 [V, 3], clear of the body's first frame
-            and of the other cloths. None: the rest mesh as it is.
+        garment: Rest mesh [m]; its pins are tied to the body's surface, or held in place without a body.
+        start: Positions at the start [m], float32 [V, 3], clear of the body's first frame and of the other cloths.
+            None takes the rest mesh.
         edge: Typical edge length [m].
-        material: What it is made of.
+        material: Material of the cloth.
     """
 
     garment: Garment
@@ -74,13 +74,13 @@ class ClothScene:
     """Garments on a moving body, in the wind.
 
     Attributes:
-        cloths: Innermost first.
-        body_frames: Body vertices [m], float32 [T, U, 3], Y up; None: no body.
-        body_faces: What cloth collides with, int32 [G, 3]; not every vertex need be used by a face.
-        frames: Number of frames T where there is no body.
+        cloths: Garments, innermost first.
+        body_frames: Body vertices [m], float32 [T, U, 3], Y up; None for no body.
+        body_faces: Faces with which cloth collides, int32 [G, 3]; they need not use every vertex.
+        frames: Number of frames T without a body.
         fps: Frames per second.
-        wind: Velocity of the air in each frame [m/s], [T, 3]; None: still air.
-        settle: Frames simulated in the first pose, before the first frame that is returned.
+        wind: Velocity of the air in each frame [m/s], [T, 3]; None for still air.
+        settle: Number of frames simulated in the first pose before the first frame that is returned.
         gravity: Acceleration [m/s^2].
     """
 
@@ -108,9 +108,9 @@ class Teacher(Protocol):
     name: str
 
     def simulate(self, scene: ClothScene) -> Iterator[np.ndarray]:
-        """Yields T frames, float32 [V, 3], cloths end to end; the first is the settled drape.
+        """Yields T frames [m], float32 [V, 3], cloths end to end; the first is the settled drape.
 
-        The caller stops early by leaving the loop; whatever the teacher holds is released then.
+        A caller may leave the loop early; the teacher then releases its resources.
 
         Raises:
             TeacherError: The simulation could not run; the message says why and what to do.
@@ -118,16 +118,16 @@ class Teacher(Protocol):
         ...
 
     def simulate_many(self, scenes: list[ClothScene]) -> Iterator[list[np.ndarray | None]]:
-        """Several scenes at once, each in a world of its own: per frame one array a scene, None once it has ended."""
+        """Simulates several separate scenes at once; yields a list of one array per scene, None after its end."""
         ...
 
     def settings(self) -> dict[str, Any]:
-        """What the result depends on besides the scene, as plain values for a manifest: settings and versions."""
+        """Settings and versions on which the result depends besides the scene, as plain values for a manifest."""
         ...
 
 
 class TeacherError(RuntimeError):
-    """A physics teacher could not run, or failed on the way."""
+    """A physics teacher could not run, or failed during a simulation."""
 
 
 def make_teacher(name: str, device: str | None = "cpu") -> Teacher:
@@ -135,11 +135,11 @@ def make_teacher(name: str, device: str | None = "cpu") -> Teacher:
 
     Args:
         name: A key of `TEACHERS`.
-        device: Warp device, such as "cpu" or "cuda:0", of teachers that run in this process; None: Warp's default.
+        device: Warp device, such as "cpu" or "cuda:0", of teachers that run in this process; None for Warp's default.
 
     Raises:
-        ValueError: Unknown name.
-        MissingExtra: What it needs is not installed.
+        ValueError: The name is not in `TEACHERS`.
+        MissingExtra: The extra of the teacher is not installed.
         TeacherError: Blender's environment has not been made.
     """
     if name not in TEACHERS:

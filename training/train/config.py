@@ -23,39 +23,42 @@ class TrainConfig:
 
     Attributes:
         data: Folder of sequences.
-        out: Folder for everything that is written.
-        network: Shape to start from; "fast" is a network of patches, see patch_network.py.
-        overrides: Changes to it, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
-        init: Checkpoint to start from instead of random weights (its shape and statistics are kept): a file, a folder,
-            or the name of a network that ships. A network of patches may start from one of faces: see
-            `PatchTransformer.from_faces`.
-        grow: First grow `init` to the shape of `network` and `overrides`, without a change of what it predicts.
-        steps: Number of steps; None: as many as `time_limit` allows.
-        time_limit: Minutes after which the run stops cleanly, everything counted; None: no limit.
-        batch_size: Samples per step, of all processes together; they share them evenly.
-        splits: Subsets each garment's faces are split into at first (n_s); one of them makes a sample.
-        split_share: Share of the schedule after which garments are no longer split.
+        out: Folder for all output of the run.
+        network: Named shape of the network; "fast" is a network of patches of cloth, the others have a token for every
+            face.
+        overrides: Changes to that shape, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
+        init: Checkpoint to start from instead of random weights; its shape and statistics are kept. A file, a folder,
+            or the name of a network that ships. A network of patches can also start from one of faces with the same
+            widths.
+        grow: First grow `init` to the shape of `network` and `overrides`; its predictions stay the same.
+        steps: Number of training steps; None for as many as `time_limit` allows.
+        time_limit: Time after which the run stops cleanly, start and validation included [minutes]; None for no limit.
+        batch_size: Number of samples per step in all processes together, which share them evenly.
+        splits: Number of subsets (n_s) into which each garment's faces are split at first; one of them makes a sample.
+        split_share: Share of the schedule after which garments are no longer split, from 0 to 1.
         lr: Peak learning rate.
-        warmup: Share of the schedule that it rises over; after that it falls as a cosine to `lr_end` times the peak.
-        lr_end: See `warmup`.
-        weight_decay: Of AdamW; 0 is Adam.
+        warmup: Share of the schedule in which the learning rate rises; then it falls as a cosine to `lr_end` times the
+            peak.
+        lr_end: Learning rate at the end, as a share of the peak.
+        weight_decay: Weight decay of AdamW; 0 is Adam.
         clip: Largest norm of the gradient.
-        average: Decay of the weight average.
+        average: Decay of the moving average of the weights per step.
         precision: "bfloat16" runs the transformer in mixed precision; weights, statistics and losses stay float32.
         compile: Compile the network with torch.compile (needs Triton on a GPU, a C++ compiler on a CPU).
-        validate_every: Steps between validation rollouts.
-        validate_frames: Their length, from a cold start.
-        validate_sequences: Their number.
-        save_every: Steps between saved states.
-        log_every: Steps that a line of `log.jsonl` is the mean of; on a GPU, losses are read and checked as often.
-        statistics_batches: Batches that statistics are taken from.
-        max_sequences: Train on this many sequences only.
-        seed: Of everything random.
-        threads: CPU threads of torch; None leaves torch's own choice.
-        ahead: Batches built ahead in a thread; 0: none, in line.
-        cache: Folder for body interactions; None: beside the data.
-        device: "cpu", "cuda"; None: a GPU where there is one.
-        resume: Go on from the state in `out`, if there is one.
+        validate_every: Number of steps between validations.
+        validate_frames: Length of the validation rollouts [frames], which start cold.
+        validate_sequences: Number of validation rollouts.
+        save_every: Number of steps between saved states.
+        log_every: Number of steps of which a line of `log.jsonl` is the mean; on a GPU, losses are read and checked at
+            the same steps.
+        statistics_batches: Number of batches from which means and deviations of the data are computed.
+        max_sequences: Largest number of training sequences; None for all.
+        seed: Seed of all random numbers.
+        threads: Number of CPU threads of torch; None for torch's default.
+        ahead: Number of batches built ahead in a thread; 0 builds them when they are needed.
+        cache: Folder for precomputed body interactions; None for a folder beside the data.
+        device: "cpu" or "cuda"; None for a GPU if there is one.
+        resume: Continue from the state in `out`, if there is one.
     """
 
     data: Path
@@ -98,7 +101,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.steps is None and self.time_limit is None:
-            raise ValueError("give steps or time_limit (minutes), so that the schedule knows its end")
+            raise ValueError("give steps or time_limit (minutes), which define the end of the schedule")
         if self.grow and self.init is None:
             raise ValueError("grow needs init, the network to grow")
         for name in ("batch_size", "splits", "validate_every", "save_every", "log_every", "statistics_batches"):
@@ -125,7 +128,7 @@ class TrainConfig:
 
 
 def _value(name: str, text: str, kind: type) -> Any:
-    """A setting as its text says."""
+    """Converts the text of an override to the type of its setting."""
     if kind is tuple:
         return tuple(text.split(","))
     if kind is not bool:

@@ -1,4 +1,4 @@
-"""The log of a training run: `log.jsonl`, a line for people, and TensorBoard events where that is installed."""
+"""The log of a training run: `log.jsonl`, printed lines, and TensorBoard events if TensorBoard is installed."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from typing import Any
 from tqdm import tqdm
 
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import parsed_json, read_plain
+
+LOG_LARGEST = 1 << 30  # bytes of a log that is read
 
 
 class RunLog:
-    """Writes entries of (step, seconds, values).
+    """Writes entries of a step, seconds and values.
 
     Args:
-        out: The run's folder; None: nothing is written.
-        resumed: Step that the run goes on from; entries after it, of a run that was killed, are dropped. None: a new
+        out: Folder of the run; None writes nothing.
+        resumed: Step from which the run continues; later entries, of a run that was killed, are removed. None for a new
             run, whose log starts empty.
     """
 
@@ -32,7 +35,7 @@ class RunLog:
         self.writer = _tensorboard(self.path.parent, resumed)
 
     def write(self, step: int, seconds: float, values: dict[str, Any], *, aloud: bool = False) -> None:
-        """Adds an entry; `aloud` also prints it."""
+        """Adds an entry; with `aloud` it is also printed."""
         if self.path is None:
             return
         entry = {"step": step, "seconds": round(seconds, 1), **values}
@@ -46,7 +49,7 @@ class RunLog:
                     self.writer.add_scalar(name, value, step)
 
     def close(self) -> None:
-        """Nothing more will be written."""
+        """Closes the log."""
         if self.writer:
             self.writer.close()
 
@@ -57,19 +60,19 @@ def say(text: str) -> None:
 
 
 def json_number(value: Any) -> Any:
-    """JSON knows neither infinity nor NaN: their names instead."""
+    """A value for JSON, with NaN and infinity as text, since JSON has neither."""
     return value if not isinstance(value, float) or math.isfinite(value) else str(value)
 
 
 def _lines(path: Path) -> list[str]:
-    return path.read_text("utf-8", errors="replace").splitlines() if path.exists() else []
+    return read_plain(path, LOG_LARGEST).decode("utf-8", errors="replace").splitlines() if path.exists() else []
 
 
 def _step(line: str) -> float:
-    """Of an entry; infinity for what is none, such as half a line."""
+    """The step of an entry; infinity for a line that is not an entry, such as an incomplete one."""
     try:
-        return float(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
+        return float(parsed_json("", line)["step"])
+    except (ValueError, KeyError, TypeError, OverflowError):
         return math.inf
 
 

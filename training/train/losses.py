@@ -3,9 +3,8 @@
     L = L_def + lambda_sv L_sv + lambda_vel L_vel        lambda_sv = 1, lambda_vel = 3
 
 Each term sums the absolute differences of a face's (or component's) numbers and averages over faces (components).
-`units` says in which units: "normalised" divides every number by its standard deviation over the training set, so
-that nine small numbers and three smaller ones count alike; "physical" is the paper as printed (dimensionless Psi and
-Sigma, metres per frame).
+With units "normalised", every number is divided by its standard deviation over the training set, so that large and
+small numbers count equally. Units "physical" are those of the paper (Psi and Sigma without unit, metres per frame).
 """
 
 from __future__ import annotations
@@ -21,7 +20,14 @@ from warpgarment.nn.network import GarmentNetwork
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the loss terms and their units."""
+    """Weights of the loss terms and their units.
+
+    Attributes:
+        deformation: Weight of the loss of Psi.
+        singular_values: Weight of the loss of Sigma.
+        velocity: Weight of the loss of q.
+        units: "normalised" divides each number by its standard deviation over the training set; "physical" does not.
+    """
 
     deformation: float = 1.0
     singular_values: float = 1.0
@@ -52,15 +58,15 @@ def loss(
 
     Args:
         predicted: Normalised output of the network: [B,N,9], [B,N,3], [B,C,3].
-        target: What it should be, normalised by the same statistics.
-        network: Whose standard deviations turn normalised differences into physical ones.
+        target: Desired output, normalised by the same statistics.
+        network: Network with the standard deviations for "physical" units.
         config: Weights and units.
         velocity_mask: True where a component is real, [B,C]; None where all are.
-        components: Number of components that the velocity term is a mean over, a scalar; None: those of this batch. For
-            a part of a batch, the whole batch's number times the share that the part is: then the mean over equal parts
-            is the loss of the whole.
+        components: Divisor of the sum over components, a scalar; None for the number of real components. For a part of
+            a batch, it is the number in the whole batch times the share of the part, so that the mean over equal parts
+            is the loss of the whole batch.
         face_mask: True where a face is real, [B,N]; None where all are.
-        faces: Of faces what `components` is of components.
+        faces: Divisor of the sums over faces, like `components`.
     """
     deformation, singular_values, velocity = _differences(predicted, target, network, config)
     if face_mask is not None:
@@ -84,7 +90,7 @@ def weighted(
     face_weight: torch.Tensor,
     component_weight: torch.Tensor,
 ) -> Losses:
-    """The same with a weight for each face [B,N] and each component [B,C], which is 0 where it is none."""
+    """Loss with a weight for each face [B,N] and each component [B,C] instead of means; weights of padding are 0."""
     deformation, singular_values, velocity = _differences(predicted, target, network, config)
     parts = (
         (deformation * face_weight).sum(),
@@ -97,7 +103,7 @@ def weighted(
 def _differences(
     predicted: NormalisedOutput, target: NormalisedOutput, network: GarmentNetwork, config: LossConfig
 ) -> list[torch.Tensor]:
-    """Sums of absolute differences per face [B,N], [B,N], and per component [B,C]."""
+    """Absolute differences, summed for each face [B,N] (Psi), [B,N] (Sigma), and for each component [B,C] (q)."""
     parts = [(a.float() - b).abs() for a, b in zip(predicted, target, strict=True)]
     if config.units == "physical":
         scale = (network.psi_std, network.singular_value_std, network.q_std)

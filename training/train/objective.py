@@ -1,9 +1,9 @@
-"""What a training step differentiates: normalised inputs, feature noise, the transformer, the loss; one module, so that
-it can be compiled, and wrapped for data-parallel training, as a whole.
+"""The objective of training: feature noise, the network and the loss in one module, so that the whole can be compiled
+and wrapped for data-parallel training.
 
 With `precision="bfloat16"` the transformer runs under autocast: matrix products and attention in bfloat16 (softmax and
-sums in float32 inside), layer norms in float32. Statistics, noise, targets and the loss stay float32, and so do the
-weights, of which autocast makes copies.
+sums in float32 inside), layer norms in float32. Statistics, noise, targets, the loss and the weights, of which autocast
+makes copies, stay float32.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from .unrolled_objective import UnrolledObjective
 
 
 class CompileFailed(RuntimeError):
-    """torch.compile did not work on this machine; the message says what it needs."""
+    """torch.compile failed on this machine; the message says what it needs."""
 
 
 class Objective(nn.Module):
     """Loss of a batch.
 
     Args:
-        network: In training.
+        network: The network in training.
         config: Weights and units of the loss.
         noise: Standard deviation of Gaussian noise on the normalised inputs; 0: none.
         precision: "float32" or "bfloat16".
@@ -49,7 +49,7 @@ class Objective(nn.Module):
 
     @staticmethod
     def inputs(batch: Batch) -> tuple:
-        """What `forward` takes."""
+        """The arguments of `forward` for a batch."""
         return (
             batch.features,
             batch.velocities,
@@ -72,7 +72,7 @@ class Objective(nn.Module):
         face_mask: torch.Tensor | None = None,
         faces: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """The fields of `Batch`; returns [4], the numbers of `Losses`, in float32."""
+        """Loss of the fields of a `Batch`: the numbers of `Losses` in their order, float32 [4]."""
         rows = RowInputs(features, velocities, weights, face_mask, velocity_mask, in_network_frame=True)
         ran = run(self.network, rows, noise=self.noise, bfloat16=self.in_bfloat16, target=NetworkOutput(*target))
         assert ran.target is not None  # as one was given
@@ -81,16 +81,21 @@ class Objective(nn.Module):
 
 
 class Trainer:
-    """An objective, compiled and shared between processes as asked.
+    """Computes gradients of an objective, compiled if wanted, in one or several processes.
 
-    Gradients are averaged over the processes by DistributedDataParallel, while the backward pass still runs. Since all
-    samples of a batch have the same number of faces and all processes the same number of samples, a mean of means is
-    the mean over all faces; `Batch.components` makes it so for components.
+    DistributedDataParallel averages the gradients over the processes during the backward pass. All samples of a batch
+    have the same number of faces, and all processes the same number of samples, so the mean of the processes' means is
+    the mean over all faces. For components, and for padded faces, the divisors in `Batch` have the same effect.
+
+    Args:
+        objective: The objective.
+        group: The processes that train together.
+        compile: Whether to compile the objective.
     """
 
     def __init__(self, objective: Objective | UnrolledObjective, group: Group, compile: bool) -> None:
         self.compiled, self._worked = compile, False
-        self._inputs: Callable[..., tuple] = objective.inputs  # of the batches that go with the objective
+        self._inputs: Callable[..., tuple] = objective.inputs  # from a batch to arguments of the objective
         if compile:
             objective.compile(dynamic=True)  # the number of faces changes from batch to batch
         self._model: nn.Module = objective
@@ -98,11 +103,13 @@ class Trainer:
             self._model = DistributedDataParallel(objective, gradient_as_bucket_view=True)
 
     def backward(self, batch: Batch | UnrolledBatch) -> torch.Tensor:
-        """Leaves the gradient in the weights, and returns this process's losses, which the objective's `figures` name;
-        waits for nothing.
+        """Computes the gradient of the weights; the host does not wait for the device.
+
+        Returns:
+            The losses of this process, in the order of the objective's `figures`.
 
         Raises:
-            CompileFailed: On the first step, where the compiler is not there.
+            CompileFailed: The compiler is missing, on the first step.
         """
         try:
             losses = self._model(*self._inputs(batch))

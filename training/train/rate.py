@@ -1,4 +1,4 @@
-"""How fast a training runs: samples and operations per second, and the share of what the devices could do at best."""
+"""Speed of a training run: samples and operations per second, and the latter as a share of the devices' peak."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from warpgarment.nn.flops import matrix_peak
 
 
 class Rate:
-    """A stopwatch for training steps, which stands still while a run validates, saves or refreshes its pool.
+    """A stopwatch for training steps, which is stopped while a run validates, saves or refreshes its pool.
 
     Args:
-        device: Of this process.
+        device: Device of this process.
         precision: "float32" or "bfloat16".
-        processes: How many train together, each on such a device.
+        processes: Number of processes that train together, each on such a device.
     """
 
     def __init__(self, device: torch.device, precision: str, processes: int) -> None:
@@ -24,28 +24,28 @@ class Rate:
         self._spent, self._samples, self._flops = 0.0, 0, 0
 
     def go(self) -> None:
-        """Time counts from now on."""
+        """Starts the stopwatch."""
         self._began = time.monotonic()
 
     def stop(self) -> None:
-        """Time does not count until the next `go`."""
+        """Stops the stopwatch until the next `go`."""
         if self._began is not None:
             self._spent += time.monotonic() - self._began
         self._began = None
 
     def count(self, samples: int, flops: int) -> None:
-        """One step: samples and operations of this process alone."""
+        """Adds one step, with its numbers of samples and operations in this process."""
         self._samples += samples
         self._flops += flops
 
     def take(self) -> dict[str, float]:
         """Figures of all processes together since the last call.
 
-        Call it when the device is done with what was counted.
+        The device must have finished all steps that were counted.
 
         Returns:
-            `samples_per_second`, `model_tflops_per_second`, and where the device's peak is known
-            `matrix_peak_share`, 0..1.
+            `samples_per_second`, `model_tflops_per_second`, and, if the peak of the device is known,
+            `matrix_peak_share` from 0 to 1.
         """
         running = self._began is not None
         self.stop()
@@ -64,7 +64,7 @@ class Rate:
 
 
 def spelt(figures: dict[str, float]) -> str:
-    """`figures` of a rate for people."""
+    """Figures of `Rate.take` as text."""
     text = f"{figures['samples_per_second']:.1f} samples/s, {figures['model_tflops_per_second']:.3g} TFLOP/s"
     if "matrix_peak_share" in figures:
         text += f", {figures['matrix_peak_share']:.1%} of the matrix peak"

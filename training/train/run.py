@@ -1,4 +1,4 @@
-"""One training run: what changes from step to step."""
+"""One training run: its loop, schedule, validation and saved state."""
 
 from __future__ import annotations
 
@@ -41,14 +41,23 @@ SHARED_OUT = "All machines must see the same out folder."
 
 
 class NonFiniteLoss(ArithmeticError):
-    """The loss is not a number any more; the message names the file that holds the batch."""
+    """The loss or gradient is not finite; the message names the file that holds the batch."""
 
 
 class Run:
     """One training run.
 
-    Losses stay on the device until they are read: at every step on a CPU, every `log_every` steps on a GPU, and before
-    anything is saved, so that what is saved never comes after a loss that was not finite.
+    Losses are read from the device at every step on a CPU, every `log_every` steps on a GPU, and before a state is
+    saved, so that no state is saved after a loss that was not finite.
+
+    Args:
+        config: Settings of the run.
+        network: The network to train.
+        plan: Samples of each batch.
+        builder: Builder of single-step samples.
+        validation: Sequences for validation, from `load_validation`.
+        began: Time at which the run started, of `time.monotonic` [s].
+        group: The processes that train together.
     """
 
     def __init__(
@@ -68,7 +77,7 @@ class Run:
         chosen: Builder[Batch | UnrolledBatch] = builder
         if steps > 1:
             chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
-            ahead = 0  # a scene's solvers belong to one thread
+            ahead = 0  # the solvers of a scene must stay in one thread
         self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
@@ -78,40 +87,40 @@ class Run:
         self.read_every = 1 if self.device.type == "cpu" else config.log_every
         self.step, self.earlier, self.now, self.best = 0, 0.0, 0.0, math.inf
         self.whole_from = math.inf  # the step from which garments are no longer split
-        self.unread: list[torch.Tensor] = []  # figures of steps, on the device
-        self.recent: list[list[float]] = []  # of those read since the last line of the log
-        self.figures: dict[str, float] = {}  # of the rate, in the last line of the log
+        self.unread: list[torch.Tensor] = []  # figures of steps, still on the device
+        self.recent: list[list[float]] = []  # figures read since the last line of the log
+        self.figures: dict[str, float] = {}  # figures of the rate in the last line of the log
         self._saved: tuple[int, float] | None = None
 
-    # The schedule, the same in all processes
+    # The schedule, which is the same in all processes
 
     def elapsed(self) -> float:
-        """Seconds of training, those before a resume included."""
+        """Seconds of training, including those before a resume."""
         return self.earlier + time.monotonic() - self.began
 
     def look_at_clock(self) -> None:
-        """The first process says how late it is; what follows from that changes only here."""
+        """Takes the elapsed time from the first process, so that all processes follow the same schedule."""
         self.now = self.elapsed()
         if self.config.time_limit is not None:
             self.now = self.group.from_first(self.now)
         if self.whole_from == math.inf and self.progress(self.step) >= self.config.split_share:
-            self.whole_from = self.step + self.config.ahead + 2  # batches before are built, or being built
+            self.whole_from = self.step + self.config.ahead + 2  # earlier batches may be built already
 
     def progress(self, step: int) -> float:
-        """How far the schedule is, 0..1: by steps where their number is given, else by time."""
+        """Progress of the schedule from 0 to 1: by steps if their number is given, otherwise by time."""
         if self.config.steps is not None:
             return min(step / self.config.steps, 1.0)
         assert self.config.time_limit is not None  # one of the two is given, see `TrainConfig`
         return min(self.now / (60.0 * self.config.time_limit), 1.0)
 
     def splits(self, step: int) -> int:
-        """Subsets of faces at a step."""
+        """Number of subsets into which faces are split at a step."""
         if self.config.steps is not None:
             return self.config.splits if self.progress(step) < self.config.split_share else 1
         return self.config.splits if step < self.whole_from else 1
 
     def learning_rate(self, progress: float) -> float:
-        """Linear warm-up, then a cosine."""
+        """Learning rate at a progress from 0 to 1: a linear rise, then a cosine."""
         config = self.config
         if progress < config.warmup:
             return config.lr * max(progress / config.warmup, 1e-3)
@@ -119,7 +128,7 @@ class Run:
         return config.lr * (config.lr_end + (1.0 - config.lr_end) * 0.5 * (1.0 + math.cos(math.pi * fall)))
 
     def over(self) -> bool:
-        """Whether the run has had its steps or its time."""
+        """Whether the run has reached its number of steps or its time limit."""
         limit = self.config.time_limit
         late = limit is not None and self.now >= 60.0 * limit
         return late or (self.config.steps is not None and self.step >= self.config.steps)
@@ -127,7 +136,7 @@ class Run:
     # Start, loop, end
 
     def start(self, path: Path) -> None:
-        """Resumes, or takes the statistics of a new run."""
+        """Resumes from the state at `path`, or computes the statistics of a new run."""
         config, group = self.config, self.group
         resumed = config.resume and path.exists()
         if resumed:
@@ -136,8 +145,8 @@ class Run:
             self.step, self.earlier, self.best = progress["step"], progress["elapsed"], progress["best"]
             self.pool.step, self.recent = progress["pool_step"], progress.get("recent", [])
         elif config.init is None and group.first:
-            steps = range(2**30, 2**30 + config.statistics_batches)  # far from those of the run
-            single = Loader(self.builder, self.loader.plan, Pool(), 0.0, self.splits)  # of one step, unrolled or not
+            steps = range(2**30, 2**30 + config.statistics_batches)  # none of the run's own
+            single = Loader(self.builder, self.loader.plan, Pool(), 0.0, self.splits)  # single steps in any case
             batches = (single.build(step, splits=config.splits, part=slice(None)) for step in steps)
             self.network.set_statistics(statistics(batches, self.network))
         group.agree("the step to resume from", self.step, SHARED_OUT)
@@ -148,13 +157,13 @@ class Run:
         settings = (self.network, config.loss, config.noise.features, config.precision)
         objective = UnrolledObjective(*settings, config.unroll) if config.unroll.steps > 1 else Objective(*settings)
         self.names = (*objective.figures, "gradient_norm")
-        self.recent = [row for row in self.recent if len(row) == len(self.names)]  # else of another objective
+        self.recent = [row for row in self.recent if len(row) == len(self.names)]  # others are of another objective
         self.trainer = Trainer(objective, group, config.compile)
         self.look_at_clock()
         self.whole_from = self.step if self.progress(self.step) >= config.split_share else math.inf
 
     def loop(self) -> None:
-        """Steps until the run is over."""
+        """Trains until the run is over."""
         config = self.config
         last = config.steps if config.steps is not None else 2**31
         hidden = not self.group.first
@@ -185,7 +194,7 @@ class Run:
         bar.close()
 
     def update(self, batch: Batch | UnrolledBatch) -> None:
-        """One step of the optimiser; nothing here waits for the device."""
+        """One step of the optimiser; the host does not wait for the device."""
         config, network = self.config, self.network
         torch.manual_seed(config.seed * 1_000_003 + self.step + 2**40 * self.group.rank)  # dropout and feature noise
         for group in self.optimizer.param_groups:
@@ -199,7 +208,7 @@ class Run:
         self.rate.count(*batch.work(network.config))
 
     def read_losses(self) -> None:
-        """Fetches the figures of the steps since the last time; stops the run where one is not finite."""
+        """Reads the figures of the steps since the last call; stops the run if one is not finite."""
         if not self.unread:
             return
         rows = self.group.mean(torch.stack(self.unread)).tolist()
@@ -211,7 +220,7 @@ class Run:
             self.recent.append(row)
 
     def refresh_pool(self) -> None:
-        """Fills the pool with rollouts of the averaged network, where that is due and has not been done."""
+        """Fills the pool with rollouts of the averaged network, if that is due at this step."""
         settings = self.config.pushforward
         if not settings.share or self.step == 0 or self.step % settings.every or self.pool.step == self.step:
             return
@@ -221,7 +230,7 @@ class Run:
         self._note(pool_rollouts=len(self.pool.rollouts), pool_error_cm=100.0 * error)
 
     def validate(self) -> None:
-        """Short rollouts from cold starts; keeps the averaged network where it is the best so far."""
+        """Runs short rollouts from cold starts; saves the averaged network if it is the best so far."""
         if not self.validation or not self.group.first:
             return
         simulator, errors = self._simulator(), []
@@ -235,7 +244,7 @@ class Run:
         if error < self.best:
             self.best = error
             self._save_network("best.safetensors")
-            self.save()  # a run that is killed now must not forget that
+            self.save()  # so that a run that is killed now keeps the new best error
 
     def save(self) -> None:
         """Saves the state and the averaged network."""
@@ -249,7 +258,7 @@ class Run:
         self._saved = (self.step, self.best)
 
     def finish(self) -> Path:
-        """Saves, validates the final network if it has not been, and says which network is best."""
+        """Saves and validates the final network; returns the file of the best network."""
         self.save()
         self.validate()
         self.save()
@@ -257,7 +266,7 @@ class Run:
         best = self.group.from_first(self.best)
         return self.out / ("best.safetensors" if math.isfinite(best) else "network.safetensors")
 
-    # Small things
+    # Helpers
 
     def _periods(self) -> list[int]:
         config = self.config
@@ -283,7 +292,7 @@ class Run:
         checkpoint.save(self.average.network, self.out / name, notes=notes)
 
     def log_training(self, bar: tqdm) -> None:
-        """A line of the log: means of the figures since the last one, and the rate."""
+        """Writes a line of the log: means of the figures since the last line, and the rate."""
         self.read_losses()
         means = map(float, np.mean(self.recent, axis=0))
         self.recent.clear()
@@ -297,7 +306,7 @@ class Run:
         self.log.write(self.step, self.elapsed(), values, aloud=True)
 
     def _give_up(self, step: int) -> None:
-        """Builds the whole batch of a step again, which follows from the step's number alone, and writes it."""
+        """Builds the batch of a step again from the number of the step, writes it, and raises NonFiniteLoss."""
         path = self.out / f"not_finite_{step}.npz"
         if self.group.first:
             batch = self.loader.build(step, part=slice(None))

@@ -3,15 +3,15 @@
     warpgarment train --data sequences --out out/run --time-limit 60              # one CPU core, an hour
     warpgarment train --data sequences --out out/run --time-limit 60 --resume     # goes on where it stopped
     warpgarment train --data sequences --out out/run --steps 200000 --network base \\
-        --precision bfloat16 --compile                                            # one GPU, so many steps
-    warpgarment train --data sequences --out out/base --network base --init small --grow ...  # starts as good as small
-    torchrun --standalone --nproc-per-node 8 -m warpgarment train ...             # eight GPUs; same batches, shared
+        --precision bfloat16 --compile                                            # one GPU, a number of steps
+    warpgarment train --data sequences --out out/base --network base --init small --grow ...  # starts as small
+    torchrun --standalone --nproc-per-node 8 -m warpgarment train ...             # eight GPUs share the same batches
 
-Writes into the out folder: `network.safetensors` (averaged weights, ships), `best.safetensors` (the same at the best
-validation rollout), `state.safetensors` (everything needed to resume), `log.jsonl`, `config.json`, and TensorBoard
-events where installed. The schedule is a function of the step where `steps` is given, and of the time where only
-`time_limit` is. With `steps`, a run on one CPU that was stopped, or killed, and resumed gives the losses of an
-uninterrupted one, bit for bit.
+The out folder gets `network.safetensors` (averaged weights), `best.safetensors` (averaged weights with the least error
+in validation rollouts), `state.safetensors` (everything needed to resume), `log.jsonl`, `config.json`, and TensorBoard
+events if TensorBoard is installed. The schedule is a function of the step if `steps` is given, otherwise of the time.
+With `steps`, a run on one CPU that was stopped or killed and then resumed has the same losses as an uninterrupted one,
+bit for bit.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import torch
 
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.leftovers import remove_leftovers
+from warpgarment.io.disk.outputs import check_space, check_writable
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import architecture, build_network
 from warpgarment.training.distributed import Group, GroupError
@@ -41,21 +42,26 @@ from .training_set import NoTrainingData, load_sequences, load_validation, repor
 __all__ = ["CompileFailed", "GroupError", "NoTrainingData", "NonFiniteLoss", "Run", "TrainConfig", "train"]
 
 
+KEPT = 10  # times the weights: those of two networks, and a state of four sets, written beside the old one
+
+
 def train(config: TrainConfig) -> Path:
-    """Trains a network, together with the other processes where torchrun started several.
+    """Trains a network, together with the other processes if torchrun started several.
 
     Returns:
-        The file of the network that did best in the validation rollouts, or the final one where there were none.
+        File of the network with the least error in validation rollouts; of the final one without validation.
 
     Raises:
-        NoTrainingData: Nothing in the data folder is usable.
-        NonFiniteLoss: Training diverged.
+        NoTrainingData: No sequence in the data folder is usable.
+        NonFiniteLoss: The loss or gradient is not finite any more.
         GrowthError: `init` cannot be grown to the shape wanted.
-        CompileFailed: `compile` was asked for, and there is no compiler.
-        CheckpointError: The state to resume from does not fit.
+        CompileFailed: `compile` is set, and compilation failed.
+        CheckpointError: `init` or the state to resume from cannot be read or does not fit.
         GroupError: The processes cannot work together.
+        OutputError: `out` cannot be written to, or the disk has no room for the networks and the state.
     """
     began = time.monotonic()
+    check_writable(Path(config.out), folder=True)
     if config.threads:
         torch.set_num_threads(config.threads)
     with Group(config.device) as group:
@@ -71,10 +77,11 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
         network = architecture(wanted.architecture).start_from(given, wanted, grow=config.grow)
     else:
         network = build_network(config.network_config()).to(group.device)
+    check_space(Path(config.out), KEPT * 4 * network.parameter_count())
     skipped: dict[str, str] = {}
     try:
         sequences = load_sequences(config, network.config, skipped, group)
-        validation = load_validation(config, skipped) if group.first else []
+        validation = load_validation(config, skipped, network.config.fps) if group.first else []
         builder = SampleBuilder(sequences, network.config, config.noise, config.augmentation)
         sizes, counts = [len(s.faces) for s in sequences], [s.count - config.unroll.steps + 1 for s in sequences]
         plan = Plan(sizes, counts, config.batch_size, config.seed)
@@ -91,7 +98,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
         try:
             run.loop()
         except KeyboardInterrupt:
-            if group.size == 1:  # others may be elsewhere; what was saved last counts
+            if group.size == 1:  # other processes may be at another step; the last saved state is kept
                 run.save()
             raise
         best = run.finish()
@@ -104,7 +111,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
 
 
 def _prepare(config: TrainConfig) -> None:
-    """The out folder, without what a run that was killed left half written."""
+    """Makes the out folder, and removes incomplete files of a run that was killed."""
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     remove_leftovers(out, old=0.0)

@@ -1,12 +1,13 @@
-"""The state of a training run in one safetensors file: weights, averaged weights, optimiser, pool, and where it stands.
+"""The state of a training run in one safetensors file: weights, averaged weights, optimiser, pool, and progress.
 
-Random numbers need no state: every step draws its own from (seed, step).
+Random numbers need no state: every step makes its own from (seed, step).
 """
 
 from __future__ import annotations
 
 import copy
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from safetensors.torch import save_file
 
 from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import check_plain, parsed_json
 from warpgarment.nn.network import GarmentNetwork
+from warpgarment.training.data.schema import is_finite
 
 
 class Average:
@@ -24,7 +27,7 @@ class Average:
 
     Args:
         network: The network in training.
-        decay: Of the average; less at first, (1 + n) / (10 + n) after n updates.
+        decay: Decay per update; after n updates it is at most (1 + n) / (10 + n).
     """
 
     def __init__(self, network: GarmentNetwork, decay: float) -> None:
@@ -33,7 +36,7 @@ class Average:
 
     @torch.no_grad()
     def update(self, network: torch.nn.Module) -> None:
-        """Takes in the weights as they are now."""
+        """Adds the current weights to the average."""
         weight = 1.0 - min(self.decay, (1.0 + self.updates) / (10.0 + self.updates))
         self.updates += 1
         torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), weight)
@@ -49,7 +52,7 @@ def save(
     extra: dict[str, torch.Tensor],
     progress: dict[str, Any],
 ) -> None:
-    """Writes the state beside the path, flushes it and renames it: a run can always go on from a whole file."""
+    """Writes the state under a temporary name, flushes and renames it, so that the file `path` is always complete."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()}
     tensors |= {f"average.{k}": v for k, v in average.network.state_dict().items()}
     for index, values in optimizer.state_dict()["state"].items():
@@ -61,6 +64,27 @@ def save(
         save_file(tensors, temporary, metadata=metadata)
 
 
+def _check(progress: Any, tensors: dict[str, torch.Tensor]) -> None:
+    """Raises ValueError unless the progress has its entries and all numbers are finite."""
+    counts, numbers = ("step", "pool_step", "average_updates"), ("elapsed", "best")
+    whole = isinstance(progress, dict) and all(type(progress.get(key)) is int and progress[key] >= 0 for key in counts)
+    if not whole or not all(isinstance(progress.get(key), float | int) for key in numbers):
+        raise ValueError(f"its progress lacks one of {', '.join((*counts, *numbers))}, or it is no number")
+    rows = progress.get("recent", [])
+    if not isinstance(rows, list) or not all(isinstance(r, list) and all(map(is_finite, r)) for r in rows):
+        raise ValueError("its recent losses are not finite numbers")
+    if not 0 <= progress["elapsed"] < math.inf or math.isnan(progress["best"]):
+        raise ValueError(f"{progress['elapsed']:g} s so far, with an error of {progress['best']:g} cm at best")
+    bad = [name for name, tensor in tensors.items() if not torch.isfinite(tensor).all()]
+    if bad:
+        raise ValueError(f"{len(bad)} of {len(tensors)} tensors are not finite (first: {bad[0]})")
+    rollouts = {name.split(".")[1] for name in tensors if name.startswith("pool.")}
+    for name in rollouts:
+        place, moved = tensors.get(f"pool.{name}.place"), tensors.get(f"pool.{name}.displacement")
+        if place is None or moved is None or place.shape != (2,) or place.is_floating_point():
+            raise ValueError(f"rollout {name} of its pool has no place or no positions")
+
+
 def load(
     path: Path, network: torch.nn.Module, average: Average, optimizer: torch.optim.Optimizer
 ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -70,12 +94,14 @@ def load(
         The extra tensors, and the progress.
 
     Raises:
-        CheckpointError: The file is not a training state, or of another network.
+        CheckpointError: The file is not a training state, or is one of another network.
     """
     try:
+        check_plain(path)
         with safe_open(path, framework="pt", device="cpu") as file:
-            progress = json.loads(file.metadata()["progress"])
+            progress = parsed_json(path, file.metadata()["progress"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}
+        _check(progress, tensors)
 
         def part(prefix: str) -> dict[str, torch.Tensor]:
             return {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}

@@ -1,4 +1,4 @@
-"""The sequences of a run. What cannot be used is skipped, and its reason kept: bad data never ends a run."""
+"""The sequences of a run. Unusable ones are skipped, and the reasons kept, so that bad data never ends a run."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.objects.body import BodyMotion
 from warpgarment.training.data.sequence import Sequence, list_sequences, read_manifest
 from warpgarment.training.distributed import Group
+from warpgarment.training.rollouts import check_rate
 from warpgarment.training.samples.interactions import cached, default_cache
 from warpgarment.training.samples.recorded import SequenceData
 
@@ -24,21 +25,21 @@ SAME_DATA = "All machines must see the same data folder; compare it with `warpga
 
 
 class NoTrainingData(ValueError):
-    """No sequence can be trained on; the message counts the reasons."""
+    """No sequence can be trained on; the message gives the first reasons."""
 
 
 def load_sequences(
     config: TrainConfig, network: NetworkConfig, skipped: dict[str, str], group: Group
 ) -> list[SequenceData]:
-    """Training sequences with their cached interactions; what cannot be used goes to `skipped` with its reason.
+    """Loads the training sequences with their cached interactions; adds unusable ones and the reasons to `skipped`.
 
     Raises:
-        NoTrainingData: None can be used.
-        GroupError: Processes see different ones.
+        NoTrainingData: No sequence can be used.
+        GroupError: Processes found different sequences.
     """
     cache = Path(config.cache) if config.cache else default_cache(Path(config.data))
     folders = folders_of(Path(config.data), "train", skipped)[: config.max_sequences]
-    if group.size > 1:  # each fills its share of the cache, then all read it
+    if group.size > 1:  # each process fills a share of the cache, then all read it
         for folder in _watched(folders[group.rank :: group.size], group):
             try:
                 cached(Sequence.load(folder), folder, cache, group.device)
@@ -48,7 +49,9 @@ def load_sequences(
     sequences = []
     for folder in _watched(folders, group):
         try:
-            sequences.append(SequenceData(Sequence.load(folder), folder, cache, network, group.device))
+            sequence = Sequence.load(folder)
+            check_rate(sequence.fps, network.fps)
+            sequences.append(SequenceData(sequence, folder, cache, network, group.device))
         except Exception as error:
             skipped[folder.name] = reason_of(error)
     names = "\n".join(f"{s.name} {len(s.faces)} {s.count}" for s in sequences)
@@ -60,8 +63,13 @@ def load_sequences(
     return sequences
 
 
-def load_validation(config: TrainConfig, skipped: dict[str, str]) -> list[tuple[Sequence, BodyMotion, int]]:
-    """A few validation sequences, spread over the list, with their bodies: (sequence, body, frames to predict)."""
+def load_validation(
+    config: TrainConfig, skipped: dict[str, str], fps: float = 30.0
+) -> list[tuple[Sequence, BodyMotion, int]]:
+    """A few validation sequences, evenly spread over the list: (sequence, body, number of frames to predict).
+
+    Sequences whose frames per second are not `fps`, those of the network, are skipped.
+    """
     folders = folders_of(Path(config.data), "validation", skipped)
     wanted = min(config.validate_sequences, len(folders))
     chosen = [folders[(i * len(folders)) // wanted] for i in range(wanted)]
@@ -70,6 +78,7 @@ def load_validation(config: TrainConfig, skipped: dict[str, str]) -> list[tuple[
         try:
             sequence = Sequence.load(folder)
             body = sequence.body()
+            check_rate(body.fps, fps)
             frames = min(len(sequence.vertices), body.frames, config.validate_frames + 1)
             if frames < 2 or not np.isfinite(np.asarray(sequence.vertices[:frames])).all():
                 raise ValueError("too short, or not finite")
@@ -80,20 +89,20 @@ def load_validation(config: TrainConfig, skipped: dict[str, str]) -> list[tuple[
 
 
 def folders_of(root: Path, split: str | None, skipped: dict[str, str]) -> list[Path]:
-    """Good sequences of a split (None: of all), as `list_sequences` gives them, but that a manifest which is missing or
-    cannot be read only costs its own sequence, and goes to `skipped` with the reason.
+    """Folders of the good sequences of a split (None: of all splits), as from `list_sequences`. But if a manifest is
+    missing or cannot be read, only its sequence is left out; `skipped` gets the reason.
 
     Raises:
         FileNotFoundError: There is no such folder.
     """
     if not root.is_dir():
-        return list_sequences(root)  # says what to do
+        return list_sequences(root)  # raises FileNotFoundError with a remedy
     found = []
     for folder in sorted(path for path in root.glob("[!.]*") if path.is_dir()):
         try:
             manifest = read_manifest(folder)
         except MeshError as error:
-            if any(folder.glob("*.npy")):  # else it is no sequence
+            if any(folder.glob("*.npy")):  # a folder without arrays is not a sequence
                 skipped[folder.name] = str(error)
             continue
         if split in (None, manifest.get("split")) and manifest.get("status") == "good":
@@ -102,7 +111,7 @@ def folders_of(root: Path, split: str | None, skipped: dict[str, str]) -> list[P
 
 
 def report(skipped: dict[str, str]) -> str:
-    """How many were skipped, and why, a line each; empty where none was."""
+    """Text with the number of skipped sequences and a line with the reason for each; empty without any."""
     if not skipped:
         return ""
     lines = [f"  {name}: {reason}" for name, reason in sorted(skipped.items())]
@@ -110,10 +119,10 @@ def report(skipped: dict[str, str]) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """The reason for a skip, as text.
+    """The reason for skipping a sequence, as text.
 
     Raises:
-        MemoryError, torch.OutOfMemoryError: The error itself, where it is not the data's fault.
+        MemoryError, torch.OutOfMemoryError: The error itself is raised again, since the data are not the cause.
     """
     if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
         raise error

@@ -1,28 +1,28 @@
-r"""Training on several steps in a row: the network's own prediction becomes its next input, and gradients flow through.
+r"""Training on several steps in a row: the prediction is the input of the next step, and gradients flow through.
 
     predict -> compose -> singular values -> Poisson -> collisions -> features of the next frame -> predict -> ...
 
-with the stages of `warpgarment.sim.scene.Scene`, which the simulator runs. Every step k = 1..K has the loss of
-one-step training, in the same normalised quantities, against the answer that leads from the predicted state to the
+with the stages of `warpgarment.sim.scene.Scene`, which are those of the simulator. Every step k = 1..K has the loss of
+one-step training, in the same normalised quantities, with the target that leads from the predicted state to the
 recording:
 
     Psi_k = Phi_{t+k} Phi~_{t+k-1}^-1      Sigma_k = Sigma_{t+k}      q_k = z_{t+k} - z~_{t+k-1}      (~ predicted)
 
-and, with a weight of its own, the distance of the predicted vertices from the recorded ones in metres:
+and, with its own weight, the distance of the predicted vertices from the recorded ones in metres:
 
     L = 1/K sum_k [ L_def + lambda_sv L_sv + lambda_vel L_vel + position |V~_{t+k} - V_{t+k}| ]
 
-What is differentiated: weights at every step; the state through deformation gradients, normals, centroids, distances
-and directions to the body, singular values, velocities, the heading; singular value replacement; the Poisson solve in
-Phi and mean; collision refinement for fixed contacts; and what of the targets depends on the state. Constant are: which
-body face is nearest, its nearest point, deformation and velocity, which are found anew at every step without gradient
-(for the distance that is exact; the direction is taken to turn about a fixed point); the rotation of the residual; the
-body with what is pinned to it; recorded frames.
+Gradients flow through the network at every step; through the state, that is deformation gradients, normals, centroids,
+distances and directions to the body, singular values, velocities and the heading; through the replacement of singular
+values; through the Poisson solve, in Phi and mean; through collision refinement, for fixed contacts; and through those
+targets that depend on the state. These are constants: the nearest body face with its nearest point, deformation and
+velocity, found at every step without gradient (the gradient of the distance is still exact; that of the direction is
+for a fixed nearest point); the rotation in the residual; the body and the pins on it; recorded frames.
 
-The Poisson solve needs whole garments. The schedule's splits become the simulator's `face_splits`: all faces are seen,
-in interleaved subsets. A sample counts the same however many faces it has, so that a mean over equal parts of a batch
-is the loss of the whole. Gaussian noise on features, mirror, yaw, displaced histories and the pool work as in one-step
-training; a change of size does not. Batches are built in line, `ahead` or not.
+The Poisson solve needs whole garments, so the splits of the schedule become `face_splits` of the simulator: the network
+sees all faces, in interleaved subsets. Every sample has the same weight, whatever its number of faces, so the mean over
+equal parts of a batch is the loss of the whole batch. Gaussian noise on features, mirroring, yaw, displaced histories
+and the pool work as in one-step training; changes of size are not possible. Batches are not built ahead.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from warpgarment.training.samples.unrolled import UnrolledBatch
 
 from .losses import LossConfig, weighted
 
-MOST_STEPS = 8
+MOST_STEPS = 8  # largest K
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class UnrollConfig:
     """Settings of unrolled training.
 
     Attributes:
-        steps: Steps K in a row; 1 is one-step training, and nothing else here matters.
-        position: Weight of the position loss [1/m]; 0: none. At 2000 it is most of the loss: what rollouts are judged
-            by, where the other terms ask for every wrinkle.
-        collision_passes: Collision refinements between steps, at most; 0: none. A rollout has up to four.
+        steps: Number of steps K in a row; 1 is one-step training, for which the other settings here have no effect.
+        position: Weight of the position loss [1/m]; 0 for none. At 2000 it is most of the loss. It is the error of
+            rollouts, while the other terms count every wrinkle.
+        collision_passes: Largest number of collision refinements between steps; 0 for none. A rollout has up to four.
     """
 
     steps: int = 1
@@ -76,11 +76,11 @@ class UnrolledObjective(nn.Module):
     """Loss of a batch of unrolled samples.
 
     Args:
-        network: In training.
+        network: The network in training.
         config: Weights and units of the loss.
         noise: Standard deviation of Gaussian noise on the normalised inputs; 0: none.
-        precision: "float32" or "bfloat16", of the transformer.
-        unroll: Steps and position loss.
+        precision: Precision of the transformer, "float32" or "bfloat16".
+        unroll: Settings of unrolled training.
     """
 
     figures = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity", "position_m")
@@ -94,12 +94,12 @@ class UnrolledObjective(nn.Module):
 
     @staticmethod
     def inputs(batch: UnrolledBatch) -> tuple[UnrolledBatch]:
-        """What `forward` takes."""
+        """The arguments of `forward` for a batch."""
         return (batch,)
 
     def forward(self, batch: UnrolledBatch) -> torch.Tensor:
-        """Losses [5]: total, its three normalised terms, all means over the steps, and the mean distance of predicted
-        from recorded vertices [m] over the steps that were solved (the last one is where it has a weight)."""
+        """Losses [5]: the total and its three terms, as means over the steps, and the mean distance of predicted from
+        recorded vertices [m]. Without a weight for that distance, the last step is not solved and not in its mean."""
         found, distances = [], []
         for terms, vertices, recorded in self.steps(batch):
             found.append(terms)
@@ -111,8 +111,8 @@ class UnrolledObjective(nn.Module):
         return torch.stack([total, *terms[1:], position if self.unroll.position else position.detach()])
 
     def steps(self, batch: UnrolledBatch) -> Iterator[tuple[torch.Tensor, torch.Tensor | None, torch.Tensor]]:
-        """Yields for each step: the losses [4] of `losses.Losses`, predicted vertices [V,3] (None where nothing needs
-        the last ones) and recorded ones."""
+        """Yields for each step the losses [4] of `losses.Losses`, the predicted vertices [V,3] (None for the last step,
+        if they are not needed) and the recorded ones."""
         scene, config = batch.scene, self.network.config
         vertices, history, features = batch.vertices, batch.history, batch.features
         for k, recorded in enumerate(batch.recorded):
@@ -140,7 +140,7 @@ class UnrolledObjective(nn.Module):
 
     @staticmethod
     def _wanted(batch: UnrolledBatch, vertices: torch.Tensor, features: torch.Tensor, recorded: torch.Tensor) -> Step:
-        """The step from the state to the recorded frame."""
+        """The step that leads from the state to the recorded frame."""
         scene = batch.scene
         phi = features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3).contiguous()
         phi_next = deformation_gradient_from_inverse(scene.inverse_rest, recorded, scene.packed.faces)
@@ -167,7 +167,7 @@ class UnrolledObjective(nn.Module):
         velocities: torch.Tensor,
         target: NetworkOutput,
     ) -> tuple[NetworkOutput, torch.Tensor]:
-        """The same for the rows of a view: output in world space, and their share of the losses."""
+        """Output of the network for the rows of a view, in world space, and their share of the losses [4]."""
         garment = batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
         rows = view.inputs(stacked, velocities)._replace(
             turn=batch.turn[garment], rest_turn=batch.joint[garment], mirrored=batch.mirrored[garment]

@@ -61,6 +61,7 @@ VERBS = {
         "Roll a network out on test sequences and measure it.",
     ),
     "bench": Verb("cli.bench", "Bench", "run", "Time a rollout by stage on this machine."),
+    "info": Verb("cli.info", "Info", "run", "Say what a file holds: objects, pieces, size, unit, axis, rate, frames."),
     "view": Verb("cli.view", "View", "run", "Look at a motion, or draw it to a PNG or MP4 without a display."),
     "convert": Verb(
         "cli.convert", "Convert", "run", "Convert a motion between npz, USD, glTF, PC2 and folders of OBJ."
@@ -137,12 +138,14 @@ def spoken(**options: str) -> Iterator[None]:
     """
 
     from warpgarment.geometry.checks import REMEDY
+    from warpgarment.geometry.seams import REMEDY as SEWING
 
     argument = re.compile(rf'(?<![\w-])({"|".join(options)})=(?:"([^"]*)"|True\b)?')
 
     def translated(text: str) -> str:
         if "clean" in options:
             text = text.replace(REMEDY, f"Use {options['clean']}, or remove them.")
+            text = text.replace(SEWING, f"{options['clean']} joins them.")
         return argument.sub(lambda found: f"{options[found[1]]} {found[2] or ''}".rstrip(), text)
 
     with warnings.catch_warnings(record=True) as heard:

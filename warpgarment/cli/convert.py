@@ -10,6 +10,7 @@ import tyro
 
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.clock import in_words
 
 from . import spoken
 from .outputs import Output, check_output
@@ -25,7 +26,7 @@ class Convert:
     """Motion to write: .npz, .usd (.usda, .usdc), .glb, .pc2, or a folder of .obj. Polygons, UVs, materials and groups
     stay, as far as the format has them."""
     fps: float | None = None
-    """Resample to this rate; by default the rate stays."""
+    """Resample to this rate; by default the rate stays. The motion begins and ends when it did."""
     input_fps: float | None = None
     """Rate of the input, where its file does not say (.pc2, folders of .obj) or says something else."""
     unit: str | None = None
@@ -38,7 +39,7 @@ class Convert:
 
 def run(options: Convert) -> None:
     """Reads, resamples if asked, writes."""
-    check_output(options.output, suffixes("write_motion"))
+    check_output(options.output, suffixes("write_motion"), (options.input,))
     with spoken(mesh="--mesh", unit="--unit", fps="--input-fps", up="--up"):
         motion = BodyMotion.load(
             options.input,
@@ -50,6 +51,6 @@ def run(options: Convert) -> None:
         )
     if options.fps is not None:
         motion = motion.resampled(options.fps)
-    with spoken(output="OUTPUT"):
+    with spoken(fps="--fps"):
         motion.save(options.output)
-    print(f"{options.output}: {motion.frames} frames at {motion.fps:g} fps, {motion.vertices.shape[1]} vertices")
+    print(f"{options.output}: {in_words(motion.clock)}, {motion.vertices.shape[1]} vertices")

@@ -42,15 +42,16 @@ Output = Annotated[
 ]
 
 
-def check_output(path: Path, suffixes: Sequence[str]) -> None:
+def check_output(path: Path, suffixes: Sequence[str], inputs: Sequence[Path | None] = ()) -> None:
     """Refuses an output that cannot be written, before time is spent on what goes into it.
 
     Args:
         path: As it was typed: one with a slash at its end, or of a folder that exists, is a folder's.
         suffixes: What can be written, "" being a folder.
+        inputs: Files that are read: the mesh that is written beside a .pc2 must not be one of them, or beside one.
 
     Raises:
-        UsageError: No such format.
+        UsageError: No such format, or the mesh beside a .pc2 would replace an input.
         OutputError, FileExistsError: The name or the folder, see `io.disk.outputs`.
         MissingExtra: What writes it is not installed.
     """
@@ -65,7 +66,14 @@ def check_output(path: Path, suffixes: Sequence[str]) -> None:
     if suffix == "":
         check_replaceable(plain, FRAME)
     if suffix == ".pc2":
-        check_writable(plain.with_suffix(".obj"))  # its mesh, beside it
+        mesh = plain.with_suffix(".obj")  # beside it
+        check_writable(mesh)
+        read = [p.with_suffix(".obj") if p.suffix.lower() == ".pc2" else p for p in inputs if p is not None]
+        if mesh.exists() and any(p.exists() and mesh.samefile(p) for p in read):
+            raise UsageError(
+                f"{path}: {mesh.name} is read, and the mesh of a .pc2, its first frame, would be written over it. "
+                "Choose another name."
+            )
     format = None if suffix in (".png", ".mp4") else format_of(suffix)
     extra = "view" if format is None else format.extra
     for module in _MODULES.get(extra or "", ()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,14 @@ from typing import Any, Literal
 
 import tyro
 
+from warpgarment.errors import UsageError
+from warpgarment.io.disk.outputs import check_space
 from warpgarment.io.files import suffixes
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.clock import in_words
+from warpgarment.objects.facts import Facts
 from warpgarment.objects.garment import Garment
+from warpgarment.view.facts import facts_table
 from warpgarment.view.report import rollout_table
 
 from . import spoken
@@ -48,16 +54,22 @@ class Simulate:
     body_mesh: str | None = None
     """Name of the mesh where the body's file holds several."""
     clean: bool = False
-    """Repair the garment's mesh: join vertices at the same place, turn faces that disagree, drop broken ones."""
+    """Join seams (open borders whose vertices are at the same place, within 5 % of the edge length), turn faces that
+    disagree, drop broken ones. Written are all vertices of the file, in its order."""
     fit_rest: Path | None = None
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
     frames: int | None = None
     """Simulate only the first so many frames."""
+    out_fps: float | Literal["body", "network"] = "body"
+    """Frames per second of the result: a number, those of the body, so that the garment lies in the shot frame by
+    frame, or those of the network (30), which are simulated in any case. It begins and ends with the body."""
 
 
 def run(options: Simulate) -> None:
-    """Loads, fits if asked, rolls out, writes, and says how it went."""
-    check_output(options.out, suffixes("write_motion"))
+    """Loads, says what the files hold, fits if asked, rolls out, writes, and says how it went."""
+    check_output(options.out, suffixes("write_motion"), (options.garment, options.body, options.fit_rest))
+    if isinstance(options.out_fps, float) and not 0 < options.out_fps < math.inf:
+        raise UsageError(f"--out-fps {options.out_fps:g}: a positive number of frames a second, body or network.")
     from warpgarment.sim.simulator import Simulator
 
     with spoken(mesh="--garment-mesh", unit="--unit", up="--up", clean="--clean"):
@@ -65,6 +77,7 @@ def run(options: Simulate) -> None:
             options.garment, unit=options.unit, up=options.up, mesh=options.garment_mesh, clean=options.clean
         )
     body = _body(options.body, options)
+    print(facts_table({"garment": Facts.of(garment), "body": Facts.of(body)}), end="\n\n", flush=True)
     simulator = Simulator.from_pretrained(options.weights, device=options.device)
     simulator.timings.synchronise = True
     first = None
@@ -74,12 +87,17 @@ def run(options: Simulate) -> None:
         whole = _body(options.body, options, collider=False)
         rest = _body(options.fit_rest, options, collider=False, mesh=None)
         first = fit(garment, (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces))
-    motion = simulator.rollout(garment, body, first_vertices=first, frames=options.frames, progress=sys.stderr.isatty())
-    with spoken(out="--out"):
+    rate = None if options.out_fps == "network" else options.out_fps
+    known: dict[str, Any] = {"first_vertices": first, "frames": options.frames, "out_fps": rate}
+    with spoken(fps="--body-fps or --out-fps"):
+        fps = body.fps if rate == "body" else rate or simulator.network.config.fps
+        frames = body.clock.resampled(fps, options.frames)[0].frames
+        check_space(options.out, len(garment.vertices) * frames * 12)
+        motion = simulator.rollout(garment, body, **known, progress=sys.stderr.isatty())
         motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))
-    print(f"\nwrote {options.out}")
+    print(f"\nwrote {options.out}: {in_words(motion.clock)}")
 
 
 def _body(path: Path, options: Simulate, **more: Any) -> BodyMotion:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.io.files import whole_output
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.clock import in_words
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.view import draw
+from warpgarment.view.matched import Motion, matched
 
 from . import spoken
 from .outputs import check_output
@@ -36,6 +39,11 @@ class View:
     """Name of the mesh where the body's file holds several."""
     body_fps: float | None = None
     """Rate of the body's motion, likewise."""
+    start: float | None = None
+    """Time of the motions' first frame in seconds, where their files do not say or say something else."""
+    body_start: float | None = None
+    """Time of the body's first frame in seconds, likewise. Motions of any rates are shown at the same moments: those
+    frames of the first motion that lie in the time of all."""
     out: Path | None = None
     """Draw to this file instead of a window: .mp4 the film, .png a sheet of moments."""
     frames: int = 8
@@ -58,13 +66,14 @@ def run(options: View) -> None:
             BodyMotion.load(path, mesh=whole_output(path, options.mesh), fps=options.fps, collider=False)
             for path in options.motion
         ]
-    garments = [
-        GarmentMotion(m.vertices, m.faces, m.fps, name=p.stem) for m, p in zip(loaded, options.motion, strict=True)
-    ]
+    garments = [_garment(m, p.stem, options.start) for m, p in zip(loaded, options.motion, strict=True)]
     body = None
     if options.body is not None:
         with spoken(mesh="--body-mesh", fps="--body-fps"):
             body = BodyMotion.load(options.body, mesh=options.body_mesh, fps=options.body_fps, collider=False)
+        if options.body_start is not None:
+            body.start = options.body_start
+    body, garments = _together(body, garments, options)
     if options.out is None:
         _window(body, garments)
         return
@@ -79,6 +88,27 @@ def run(options: View) -> None:
         rows = [(", ".join(m.name for m in garments), garments, draw.PALETTE)]
         draw.sheet(options.out, body, rows, frames=options.frames, size=panel, camera=camera)
     print(f"wrote {options.out}")
+
+
+def _garment(motion: BodyMotion, name: str, start: float | None) -> GarmentMotion:
+    """What was read, as a garment, which may hold NaN."""
+    begins = motion.start if start is None else start
+    return GarmentMotion(motion.vertices, motion.faces, motion.fps, name=name, start=begins, last=motion.last)
+
+
+def _together(
+    body: BodyMotion | None, garments: list[GarmentMotion], options: View
+) -> tuple[BodyMotion | None, list[GarmentMotion]]:
+    """The motions at the first garment's frames that all have; says so where that leaves some out."""
+    paths = [*options.motion, *([options.body] if options.body is not None else [])]
+    motions: list[Motion] = [*garments, *([body] if body is not None else [])]
+    try:
+        shown: list[Any] = list(matched(motions, [str(path) for path in paths]))
+    except UsageError as error:
+        raise UsageError(f"{error} Are --fps, --start, --body-fps and --body-start right?") from None
+    if shown[0].frames < garments[0].frames:
+        print(f"shown is what all have: {in_words(shown[0].clock)}, of {in_words(garments[0].clock)}")
+    return (shown.pop() if body is not None else None), shown
 
 
 def _check_picture(options: View) -> None:

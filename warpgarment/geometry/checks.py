@@ -14,6 +14,7 @@ import numpy as np
 from warpgarment.errors import MeshError
 
 REMEDY = "Use Garment.cleaned_from(vertices, faces), Garment.load(path, clean=True) for a file, or remove them."
+COARSE = 0.02  # steps of float32, as a share of the mean edge length, beyond which the shape of a mesh suffers
 FLAT = 1e-6  # a face lower than this share of the mesh's size has no area: in float32 it does not differ from a line
 
 
@@ -127,6 +128,37 @@ def no_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     return double_area <= FLAT * size * longest
+
+
+def far_from_origin(vertices: Any, faces: np.ndarray, what: str) -> str:
+    """A sentence for a warning about a mesh that is so far from the origin that float32 cannot tell its shape.
+
+    Args:
+        vertices: Positions as they were given [m], shape [V,3], finite.
+        faces: Vertex indices in range, shape [F,3].
+        what: What the sentence calls the mesh.
+
+    Returns:
+        The sentence, where float32 positions are farther apart than `COARSE` of the mean edge length, or more faces
+        have no area than if the mesh were at the origin; otherwise an empty text.
+    """
+    given = to_numpy(vertices)[np.unique(faces)].astype(np.float64)
+    largest = float(np.abs(given).max())
+    step = float(np.spacing(np.float32(largest)))
+    if step < 1e-5:  # less than 100 m away
+        return ""
+    exact = to_numpy(vertices).astype(np.float64)
+    rounded = exact.astype(np.float32)
+    corners = exact[faces]
+    edge = float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).mean())
+    lost = np.count_nonzero(no_area(rounded, faces) & ~no_area(exact - given.mean(axis=0), faces))
+    if step <= COARSE * edge and not lost:
+        return ""
+    return (
+        f"{what} is {largest / 1e3:.3g} km from the origin, where positions in float32 are {1e3 * step:.2g} mm apart: "
+        f"{lost:,} of {len(faces):,} faces have no area there. Move garment and body to the origin, both by the same "
+        "offset, before they are exported."
+    )
 
 
 def duplicate_faces(faces: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
@@ -9,25 +11,53 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 from warpgarment.errors import MeshError
 
 from .checks import directed_edges, duplicate_faces, no_area, repeated_vertices, to_numpy
+from .seams import Seams, coinciding_borders
 
-MERGE = 1e-6  # vertices closer than this share of the bounding box are merged
+
+class Cleaned(NamedTuple):
+    """A mesh that was cleaned, and where it came from."""
+
+    vertices: np.ndarray
+    """Positions [m], float32 [V',3]."""
+    faces: np.ndarray
+    """Vertex indices, int32 [F',3]."""
+    went: np.ndarray
+    """New index of each old vertex, int64 [V]; -1 if it was dropped."""
+    corners: np.ndarray
+    """The old vertices of each new face, int64 [F',3]."""
+    turned: int
+    """Faces that were turned round."""
+    dropped: int
+    """Faces that are gone."""
+    seams: Seams
+    """Vertices of open borders that were joined."""
+
+    def message(self, what: str) -> str:
+        """A sentence for a warning about `what`, on all that was changed; empty where nothing was."""
+        did = []
+        if self.seams.sides:
+            did.append(f"{self.seams.found()} and are joined")
+        if self.dropped:
+            did.append(f"{self.dropped:,} of {len(self.faces) + self.dropped:,} faces are dropped")
+        if self.turned:
+            did.append(f"{self.turned:,} faces that disagreed with the others about the outside are turned round")
+        said = [f"{what}: {'; '.join(did)}."] if did else []
+        return " ".join([*said, self.seams.unjoined()]).strip()
 
 
-def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merges duplicate vertices, drops all that a rest mesh may not have, and makes the faces agree on an outside.
+def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> Cleaned:
+    """Joins open borders, drops all that a rest mesh may not have, and makes the faces agree on an outside.
 
-    Dropped are vertices that are not finite with their faces, faces with indices out of range, faces that use a vertex
-    twice, have no area or repeat another face; where more than two faces share an edge, the largest two stay. Faces are
-    flipped to agree with the majority, by area, of their component; where no agreement is possible (a Möbius strip) the
-    faces on one side of the seam are dropped. Vertices without a face are dropped last.
+    Joined are vertices of open borders that are at the same place, see `seams`; vertices inside a surface stay as they
+    are. Dropped are vertices that are not finite with their faces, faces with indices out of range, faces that use a
+    vertex twice, have no area, or repeat another face or exactly its place, as do those of a mesh with two sides; where
+    more than two faces share an edge, the largest two stay. Faces are flipped to agree with the majority, by area, of
+    their component; where no agreement is possible (a Möbius strip) the faces on one side of the seam are dropped.
+    Vertices without a face are dropped last.
 
     Args:
         vertices: Positions [m], shape [V,3].
         faces: Vertex indices, shape [F,3].
-
-    Returns:
-        Vertices [m], float32 [V',3]; faces, int32 [F',3]; new index of each old vertex, int64 [V], -1 if it was
-        dropped.
 
     Raises:
         MeshError: Nothing is left, or the arrays have another shape.
@@ -35,46 +65,48 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
     vertices, faces = np.asarray(to_numpy(vertices), dtype=np.float32), to_numpy(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(f"Need vertices [V,3] and faces [F,3], got {list(vertices.shape)} and {list(faces.shape)}.")
-    faces = faces.astype(np.int64)
-    faces = faces[((faces >= 0) & (faces < len(vertices))).all(axis=1)]
+    corners, count = faces.astype(np.int64), len(faces)
+    corners = corners[((corners >= 0) & (corners < len(vertices))).all(axis=1)]
     usable = np.isfinite(vertices).all(axis=1)
-    faces = faces[usable[faces].all(axis=1)]
-    merged = _merge(vertices, usable)
-    faces = _no_flat_faces(vertices, merged[faces])
-    faces = faces[_largest_two_per_edge(vertices, faces)]
-    faces = _orient(vertices, faces)
-    if len(faces) == 0:
+    corners = corners[usable[corners].all(axis=1)]
+    corners = corners[_with_area(vertices, _exact(vertices)[corners])]
+    seams = coinciding_borders(vertices, corners)
+    merged = seams.group
+    corners = corners[_with_area(vertices, merged[corners])]
+    corners = corners[_largest_two_per_edge(vertices, merged[corners])]
+    flip, keep = _orient(vertices, merged[corners])
+    corners = np.where(flip[:, None], corners[:, ::-1], corners)[keep]
+    if len(corners) == 0:
         raise MeshError("Nothing is left after cleaning: no face has three different, finite vertices and an area.")
-    used = np.unique(faces)
+    used = np.unique(merged[corners])
     position = np.full(len(vertices), -1)
     position[used] = np.arange(len(used))
     went = np.where(usable, position[merged], -1)
-    return vertices[used], position[faces].astype(np.int32), went
+    return Cleaned(
+        vertices[used],
+        went[corners].astype(np.int32),
+        went,
+        corners,
+        int(np.count_nonzero(flip[keep])),
+        count - len(corners),
+        seams,
+    )
 
 
-def _merge(vertices: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """For each vertex, the lowest index at the same place, from a tree; a grid would miss pairs across its cells."""
-    from scipy.spatial import cKDTree
-
-    group = np.arange(len(vertices))
-    points = vertices[usable].astype(np.float64)
-    if len(points):
-        size = np.linalg.norm(np.ptp(points, axis=0))
-        pairs = cKDTree(points).query_pairs(MERGE * size, output_type="ndarray")
-        if len(pairs):
-            graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
-            label = connected_components(graph, directed=False)[1]
-            lowest = np.unique(label, return_index=True)[1]
-            index = np.nonzero(usable)[0]
-            group[index] = index[lowest[label]]
-    return group
+def _exact(vertices: np.ndarray) -> np.ndarray:
+    """For each vertex the first at exactly the same place, [V]."""
+    first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)[1:]
+    return np.asarray(first[inverse.reshape(-1)])
 
 
-def _no_flat_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    faces = faces[~repeated_vertices(faces)]
-    if len(faces):
-        faces = faces[~no_area(vertices, faces)]
-    return faces[~duplicate_faces(faces)] if len(faces) else faces
+def _with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Mask of faces that have an area and repeat no other that has one."""
+    keep = ~repeated_vertices(faces)
+    if keep.any():
+        keep[keep] = ~no_area(vertices, faces[keep])
+    if keep.any():
+        keep[keep] = ~duplicate_faces(faces[keep])
+    return np.asarray(keep)
 
 
 def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -103,10 +135,10 @@ def _largest_two_per_edge(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray
     return keep
 
 
-def _orient(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Flips faces so that neighbours agree; drops one face at each edge where that is impossible."""
+def _orient(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which faces to flip so that neighbours agree, and which to keep: one is dropped where that is impossible."""
     if len(faces) == 0:
-        return faces
+        return np.zeros(0, dtype=bool), np.zeros(0, dtype=bool)
     directed, edge_of = directed_edges(faces), _edge_of(faces).reshape(-1)
     order = np.argsort(edge_of, kind="stable")
     same = edge_of[order[1:]] == edge_of[order[:-1]]
@@ -126,8 +158,7 @@ def _orient(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     area = _areas(vertices, faces)
     flipped = np.bincount(component, weights=area * flip) > 0.5 * np.bincount(component, weights=area)
     flip ^= flipped[component]
-    faces = np.where(flip[:, None], faces[:, ::-1], faces)
     torn = (flip[a] ^ flip[b]) != disagree
     keep = np.ones(count, dtype=bool)
     keep[b[torn]] = False
-    return faces[keep]
+    return flip, keep

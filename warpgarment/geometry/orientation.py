@@ -18,6 +18,8 @@ from typing import NamedTuple
 import igl
 import numpy as np
 
+from warpgarment.kernels.mesh.caps import caps_of
+
 from .checks import directed_edges
 
 FLAT = 1e-3
@@ -135,8 +137,6 @@ def _reversed(faces: np.ndarray, oriented: np.ndarray) -> np.ndarray:
 
 def _measures(vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Area [m2] and signed volume [m3] of each piece, and whether it is closed, all [P]."""
-    from warpgarment.kernels.sdf.inside import caps_of  # its room loads torch
-
     count = int(piece.max()) + 1
     # pieces share no vertex in what follows, so that a cap belongs to one of them
     keys, own = np.unique(piece[:, None].astype(np.int64) * len(vertices) + faces, return_inverse=True)

@@ -31,8 +31,11 @@ def linear_blend_skinning(
             finite.
     """
     rest = checked_positions(rest_vertices, name="rest_vertices").astype(np.float64)
-    indices, weights = to_numpy(bone_indices), to_numpy(bone_weights).astype(np.float64)
-    transforms = to_numpy(bone_transforms).astype(np.float64)
+    indices, weights, transforms = map(to_numpy, (bone_indices, bone_weights, bone_transforms))
+    for name, array in (("bone_weights", weights), ("bone_transforms", transforms)):
+        if array.dtype.kind not in "fiu":
+            raise MeshError(f"{name} must be numbers, got {array.dtype}.")
+    weights, transforms = weights.astype(np.float64), transforms.astype(np.float64)
     count = len(rest)
     if indices.ndim != 2 or len(indices) != count or weights.shape != indices.shape or indices.dtype.kind not in "iu":
         raise MeshError(

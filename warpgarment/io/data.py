@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,7 +44,9 @@ class MotionData(NamedTuple):
         name: Of the mesh inside the file; empty where it has none.
         extra: Further arrays by name, in formats that keep them.
         step: How many frames of the rate lie between two of these, as the file says; `fps` is for one of them.
-        start: Number of the first frame, in steps.
+        start: Number of the first frame, in steps, counted from time 0; None where the file does not say.
+        seconds: Time of the first frame [s], where the file says that in place of a number, or besides.
+        last: When the last frame is reached, in frames after the first, where that is not T - 1.
         surface: As of `MeshData`.
     """
 
@@ -55,8 +57,16 @@ class MotionData(NamedTuple):
     name: str = ""
     extra: Mapping[str, np.ndarray] = {}
     step: float = 1.0
-    start: float = 0.0
+    start: float | None = None
+    seconds: float | None = None
+    last: float | None = None
     surface: Surface | None = None
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, faces: np.ndarray, clock: Any, **more: Any) -> MotionData:
+        """A motion with frames at the times of an `objects.clock.Clock`."""
+        held = clock.last if clock.last != clock.frames - 1 else None
+        return cls(vertices, faces, clock.fps, start=clock.number, seconds=clock.start, last=held, **more)
 
 
 class ReadOptions(NamedTuple):
@@ -70,6 +80,20 @@ class ReadOptions(NamedTuple):
 
     mesh: str | None = None
     unit: str | None = None
+    up: str | None = None
+
+
+class Holds(NamedTuple):
+    """What a file says of itself.
+
+    Attributes:
+        names: Names of the objects (or, of OBJ without objects, groups) that have faces, each of which can be read.
+        metres: Metres in its unit; None: it does not say.
+        up: Axis that points up, "y" or "z"; None: it does not say.
+    """
+
+    names: tuple[str, ...] = ()
+    metres: float | None = None
     up: str | None = None
 
 
@@ -93,6 +117,7 @@ class Format(NamedTuple):
         write_motion: Writes one.
         only_read: Suffixes of the format that are read and never written.
         axis: Whether the files say which axis is up, or the format does.
+        holds: Lists what a file holds, without reading its positions; None: one object, without a name.
         named: Whether meshes in a file have names; otherwise `ReadOptions.mesh` is refused before reading.
     """
 
@@ -104,6 +129,7 @@ class Format(NamedTuple):
     only_read: tuple[str, ...] = ()
     named: bool = False
     axis: bool = False
+    holds: Callable[[Path], Holds] | None = None
 
 
 def scale_of(unit: str | None) -> float:

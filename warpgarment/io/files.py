@@ -13,6 +13,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError, UsageError
 from warpgarment.io.disk.outputs import names_folder
+from warpgarment.io.disk.plain import check_plain
 
 from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
 from .parts import ALL, unnamed
@@ -150,6 +151,16 @@ def rate_of(path: Path, data: MotionData, fps: float | None) -> float:
     return rate / data.step
 
 
+def start_of(data: MotionData, fps: float) -> float:
+    """Time of the first frame [s]: what the file says in seconds, else the number of the frame, at this rate; else 0.
+
+    Args:
+        data: What was read.
+        fps: Frames per second, as `rate_of` has them.
+    """
+    return data.seconds if data.seconds is not None else (data.start or 0.0) / fps
+
+
 def write_mesh(path: Path, data: MeshData) -> None:
     """Writes a mesh by suffix, completely or not at all.
 
@@ -203,6 +214,8 @@ def _placed(vertices: np.ndarray, scale: float, up: str | None) -> np.ndarray:
 def _reader(path: Path, ability: Literal["read_mesh", "read_motion"], options: ReadOptions) -> Format:
     if not path.exists():
         raise FileNotFoundError(f"No such file: {path}")
+    if not path.is_dir():
+        check_plain(path)
     suffix, able = "" if path.is_dir() else path.suffix.lower(), suffixes(ability)
     if suffix in able and (suffix or path.is_dir()):
         format = format_of(suffix)

@@ -15,8 +15,8 @@ from warpgarment.io.surface.mtl import mtl_text
 from warpgarment.io.surface.obj import OBJ_KEEPS, has_materials, text_around
 from warpgarment.io.surface.record import of_triangles, say_left_out
 
-from .data import Format, MotionData, ReadOptions
-from .obj import chosen_polygons, obj_text, read_polygons, surface_of
+from .data import Format, Holds, MotionData, ReadOptions
+from .obj import chosen_polygons, obj_holds, obj_text, read_polygons, surface_of
 from .polygons import triangulate_counts
 
 LIBRARY = "materials.mtl"
@@ -57,20 +57,22 @@ def read_folder(path: Path, options: ReadOptions) -> MotionData:
         faces = triangulate_counts(frames[0], counts, corners)
     except MeshError as error:
         raise MeshError(f"{files[0]}: {error}") from None
-    numbers = _numbers(files)
+    told = _numbers(files)
+    numbers = told if told is not None else list(range(len(files)))
     surface = surface_of(files[0], first, options.mesh, used)
     step, vertices = _spread(path, numbers, np.stack(frames))
     with np.errstate(over="ignore"):
-        return MotionData(vertices.astype(np.float32), faces, step=step, start=numbers[0] / step, surface=surface)
+        start = numbers[0] / step if told is not None else None
+        return MotionData(vertices.astype(np.float32), faces, step=step, start=start, surface=surface)
 
 
-def _numbers(files: list[Path]) -> list[int]:
-    """Frame numbers: the last number in each name, where every name has one, otherwise the places in the list."""
+def _numbers(files: list[Path]) -> list[int] | None:
+    """Frame numbers: the last number in each name; None where a name has none, or they do not rise."""
     found = [re.findall(r"\d+", file.stem) for file in files]
     if not all(found):
-        return list(range(len(files)))
+        return None
     numbers = [int(words[-1][:15]) for words in found]
-    return numbers if (np.diff(numbers) > 0).all() else list(range(len(files)))
+    return numbers if (np.diff(numbers) > 0).all() else None
 
 
 def _spread(path: Path, numbers: list[int], frames: np.ndarray) -> tuple[int, np.ndarray]:
@@ -105,21 +107,37 @@ def _spread(path: Path, numbers: list[int], frames: np.ndarray) -> tuple[int, np
 
 
 def write_folder(path: Path, data: MotionData) -> None:
-    """Writes frame_0000.obj, frame_0001.obj, ..., and materials.mtl where there are materials.
+    """Writes frame_1001.obj, frame_1002.obj, ... from the number of the first frame on, and materials.mtl if need be.
 
     A folder that holds nothing else is replaced.
+
+    Warns:
+        UserWarning: The first frame lies between two numbers, or before 0.
     """
+    begins = data.start or 0.0
+    first = max(round(begins), 0)
+    if abs(begins - first) > 1e-3:
+        warnings.warn(
+            f"{path}: the motion starts at frame {begins:g} of {data.fps or 0:g} a second; files have whole numbers "
+            f"from 0 on, so the first one is {first}.",
+            UserWarning,
+            stacklevel=4,
+        )
     say_left_out(path, data.surface, sets=1, keeps=OBJ_KEEPS)
-    digits = max(4, len(str(len(data.vertices) - 1)))
     library = LIBRARY if has_materials(data.surface) else ""
     around = text_around(data.surface or of_triangles(data.faces), data.name, library)
+    digits = max(4, len(str(first + len(data.vertices) - 1)))
     with atomic_folder(path, FRAME) as folder:
         if library and data.surface is not None:
             (folder / library).write_text(mtl_text(data.surface, path), encoding="utf-8")
-        for frame, positions in enumerate(data.vertices):
-            (folder / f"frame_{frame:0{digits}d}.obj").write_text(
-                obj_text(positions, data.faces, data.name, around), encoding="utf-8"
-            )
+        for frame, positions in enumerate(data.vertices, first):
+            text = obj_text(positions, data.faces, data.name, around)
+            (folder / f"frame_{frame:0{digits}d}.obj").write_text(text, encoding="utf-8")
 
 
-FORMAT = Format(read_motion=read_folder, write_motion=write_folder, named=True)
+def _holds(path: Path) -> Holds:
+    first = next((file for file in sorted(path.glob("[!.]*")) if file.suffix.lower() == ".obj"), None)
+    return obj_holds(first) if first else Holds()
+
+
+FORMAT = Format(read_motion=read_folder, write_motion=write_folder, named=True, holds=_holds)

@@ -9,13 +9,14 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, cast
 
 import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import open_plain
 from warpgarment.io.surface.arrays import PREFIX, from_arrays, to_arrays
 from warpgarment.io.surface.record import Surface, worth_keeping
 
@@ -25,6 +26,7 @@ from .parts import ALL, Parts, named
 MAGIC = b"\x93NUMPY"
 LARGE, RATIO = 64 << 20, 100  # bytes of an array from which on it is asked how much smaller it is in the file
 RATE = re.compile(r".*fps|.*framerate|framespersecond|sampl(e|ing)rate")  # letters of the names that rates have
+TIMES = ("start", "start_frame", "last")  # of the first frame [s], or its number; see `MotionData.last`
 SKINNED = ("rest_vertices", "faces", "bone_indices", "bone_weights", "bone_transforms")
 
 
@@ -44,7 +46,7 @@ def read_npz(
         FileNotFoundError: There is no such file.
     """
     path = Path(path)
-    with open(path, "rb") as file:
+    with open_plain(path) as file:
         if file.read(len(MAGIC)) == MAGIC:
             raise MeshError(f"{path} is a single array, not an .npz archive.")
     try:
@@ -63,6 +65,26 @@ def read_npz(
         ) from None
 
 
+def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape of an array, whether it lies by columns, and its type, from the beginning of a .npy file.
+
+    Raises:
+        ValueError: The file does not begin as one, or its header is no header. NumPy parses it as Python's syntax, with
+            every error that Python's parsers have.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, by_columns, dtype = read(file)
+    except OSError:
+        raise
+    except Exception as error:  # TokenError, SyntaxError, RecursionError, OverflowError, ...
+        raise ValueError(f"no header of an array ({type(error).__name__}: {str(error)[:100]})") from None
+    if min(shape, default=0) < 0:
+        raise ValueError(f"no header of an array (its shape is {list(shape)})")
+    return shape, by_columns, dtype
+
+
 def _array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     """One array; whatever the libraries underneath make of a damaged one becomes a MeshError."""
     name = member.filename
@@ -73,14 +95,12 @@ def _array(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.
         )
     try:
         with archive.open(member) as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, by_columns, dtype = read(file)
+            shape, by_columns, dtype = array_header(file)
             header = file.tell()
             if dtype.hasobject or dtype.names or dtype.itemsize == 0:
                 raise ValueError("pickled objects or records")
             size = dtype.itemsize * math.prod(shape)
-            if size != member.file_size - header or min(shape, default=0) < 0:
+            if size != member.file_size - header:
                 raise ValueError(f"shape {list(shape)} where there are {member.file_size - header:,} bytes")
             data = bytearray(size)
             if cast(BufferedIOBase, file).readinto(data) != size or file.read(1):
@@ -112,7 +132,7 @@ def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     """Positions, or a rest mesh with bones that move it."""
-    known = {"vertices", "collider_faces", *SKINNED}
+    known = {"vertices", "collider_faces", *TIMES, *SKINNED}
     arrays = read_npz(
         path,
         ("faces",),
@@ -133,12 +153,14 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
             raise MeshError(f"{path}: {error}") from None
     _check_name(path, arrays, options.mesh)
     fps = _rate(path, arrays)
+    seconds, start, last = (_number(path, key, arrays[key]) if key in arrays else None for key in TIMES)
+    for key, value in zip(TIMES, (seconds, start, last), strict=True):
+        if value is not None and not math.isfinite(value):
+            raise MeshError(f"{path}: {key} must be finite, not {value}.")
     others = {key for key in arrays if key in known or _is_rate(key) or key.startswith(PREFIX)}
     extra = {key: array for key, array in arrays.items() if key not in others}
-    surface = _surface(path, arrays)
-    return MotionData(
-        vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra, surface=surface
-    )
+    whole = MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
+    return whole._replace(start=start, seconds=seconds, last=last, surface=_surface(path, arrays))
 
 
 def _surface(path: Path, arrays: Mapping[str, np.ndarray]) -> Surface | None:
@@ -159,14 +181,18 @@ def _rate(path: Path, arrays: Mapping[str, np.ndarray]) -> float | None:
     """Frames per second under one of the names that people use; None where there is none."""
     found: dict[str, float] = {}
     for key in filter(_is_rate, arrays):
-        try:
-            found[key] = float(arrays[key].reshape(()))
-        except (TypeError, ValueError):
-            raise MeshError(f"{path}: {key} must be a single number.") from None
+        found[key] = _number(path, key, arrays[key])
     if len(set(found.values())) > 1:
         listed = ", ".join(f"{key} {rate:g}" for key, rate in found.items())
         raise MeshError(f"{path}: rates that differ: {listed}. Keep one of them.")
     return next(iter(found.values()), None)
+
+
+def _number(path: Path, key: str, array: np.ndarray) -> float:
+    try:
+        return float(array.reshape(()))
+    except (TypeError, ValueError):
+        raise MeshError(f"{path}: {key} must be a single number.") from None
 
 
 def _check_name(path: Path, arrays: Mapping[str, np.ndarray], mesh: str | None) -> None:
@@ -193,8 +219,9 @@ def _write_mesh(path: Path, data: MeshData) -> None:
 
 
 def _write_motion(path: Path, data: MotionData) -> None:
-    rate = {} if data.fps is None else {"fps": np.array(data.fps, dtype=np.float64)}
-    arrays = {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **rate, **data.extra}
+    times = {"fps": data.fps, "start": data.seconds, "last": data.last}
+    told = {key: np.array(value, dtype=np.float64) for key, value in times.items() if value is not None}
+    arrays = {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **told, **data.extra}
     write_npz(path, arrays | to_arrays(data.surface))
 
 

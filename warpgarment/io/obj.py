@@ -17,10 +17,11 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_files
+from warpgarment.io.disk.plain import read_plain
 from warpgarment.io.surface.obj import OBJ_KEEPS, Around, Looks, obj_files, text_around, without_unused
 from warpgarment.io.surface.record import Labels, Surface, of_triangles, say_left_out, worth_keeping
 
-from .data import Format, MeshData, ReadOptions
+from .data import Format, Holds, MeshData, ReadOptions
 from .parts import ALL, Parts, connected_pieces, listed, named, unconnected, used_only
 from .polygons import triangulate_counts
 
@@ -179,10 +180,7 @@ def read_polygons(path: Path, *, dressed: bool = True) -> ObjMesh:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines that say something, without comments; lines of numbers with those that continue them."""
-    try:
-        data = path.read_bytes()
-    except IsADirectoryError:
-        raise MeshError(f"{path} is a folder, not an OBJ file.") from None
+    data = read_plain(path, text=True)
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = data.decode("utf-16" if wide else "utf-8-sig", errors="replace" if wide else "surrogateescape")
     if "\0" in text[:4096]:
@@ -227,6 +225,22 @@ def obj_text(vertices: np.ndarray, faces: np.ndarray, name: str = "", around: Ar
     return (around or text_around(of_triangles(faces), name)).of(vertices)
 
 
+def obj_holds(path: Path) -> Holds:
+    """Names of the objects of an OBJ file that have faces, or of its groups where it has no two objects."""
+    objects: dict[str, None] = {}
+    groups: dict[str, None] = {}
+    name = group = ""
+    for _, line in _lines(path):
+        if line.startswith("f"):
+            objects[name] = groups[group] = None
+        elif line.startswith(("o ", "o\t")):
+            name = " ".join(line.split()[1:])
+        elif line.startswith(("g ", "g\t")):
+            group = " ".join(line.split()[1:])
+    named = [[name for name in kind if name] for kind in (objects, groups)]
+    return Holds(tuple(named[1] if len(named[0]) < 2 and len(named[1]) > 1 else named[0]))
+
+
 def _read(path: Path, options: ReadOptions) -> MeshData:
     return _mesh(path, read_polygons(path), options.mesh)
 
@@ -239,4 +253,4 @@ def _write(path: Path, data: MeshData) -> None:
             file.write_text(text, encoding="utf-8")
 
 
-FORMAT = Format(read_mesh=_read, write_mesh=_write, named=True)
+FORMAT = Format(read_mesh=_read, write_mesh=_write, named=True, holds=obj_holds)

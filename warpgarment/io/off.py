@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.disk.plain import read_plain
 from warpgarment.io.surface.record import Surface, worth_keeping
 
 from .data import Format, MeshData, ReadOptions
@@ -21,8 +22,9 @@ def read_off(path: Path) -> MeshData:
     Raises:
         MeshError: Not an OFF file in text form, cut short, or a face names a vertex that does not exist.
     """
+    data = read_plain(path, text=True)
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = data.decode("utf-8-sig")
         rows = [row for line in text.splitlines() if (row := line.split("#", 1)[0].split())]
         head = rows[0][0]
         if head not in HEADERS:

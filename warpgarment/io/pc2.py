@@ -6,6 +6,7 @@ samples
 
 from __future__ import annotations
 
+import os
 import struct
 import warnings
 from pathlib import Path
@@ -15,11 +16,12 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_files
+from warpgarment.io.disk.plain import open_plain
 from warpgarment.io.surface.obj import OBJ_KEEPS, obj_files
 from warpgarment.io.surface.record import say_left_out
 
-from .data import Format, MotionData, ReadOptions
-from .obj import chosen_polygons, read_polygons, surface_of
+from .data import Format, Holds, MotionData, ReadOptions
+from .obj import chosen_polygons, obj_holds, read_polygons, surface_of
 from .parts import unnamed
 from .ply import read_ply
 from .polygons import triangulate_counts
@@ -43,26 +45,30 @@ def read_pc2(path: Path) -> PointCache:
     Raises:
         MeshError: Another signature or version, fewer bytes than the header says, or a sampling that is not positive.
     """
-    data = Path(path).read_bytes()
-    if len(data) < HEADER.size or not data.startswith(SIGNATURE[:11]):
+    path = Path(path)
+    with open_plain(path) as file:
+        head, length = file.read(HEADER.size), os.fstat(file.fileno()).st_size
+    if len(head) < HEADER.size or not head.startswith(SIGNATURE[:11]):
         raise MeshError(f"{path}: does not start with POINTCACHE2; this is not a PC2 file, or it is cut short.")
-    _, version, points, start, sampling, samples = HEADER.unpack_from(data)
+    _, version, points, start, sampling, samples = HEADER.unpack(head)
     if version != 1 or points < 1 or samples < 1:
         raise MeshError(
             f"{path}: version {version} with {points:,} points and {samples:,} samples; only version 1 is known."
         )
     size = HEADER.size + 12 * points * samples
-    if len(data) != size:
+    if length != size:
         raise MeshError(
-            f"{path}: {len(data):,} bytes where {samples:,} samples of {points:,} points need {size:,}. "
+            f"{path}: {length:,} bytes where {samples:,} samples of {points:,} points need {size:,}. "
             "The file is damaged or cut short."
         )
     if not (np.isfinite(start) and 1e-3 <= sampling <= 1e3):
         raise MeshError(
             f"{path}: the header says that samples are {sampling:g} frames apart, from frame {start:g}. Write it again."
         )
-    vertices = np.frombuffer(data, dtype="<f4", offset=HEADER.size).reshape(samples, points, 3)
-    return PointCache(vertices.astype(np.float32), start, sampling)
+    vertices = np.fromfile(path, dtype="<f4", count=3 * points * samples, offset=HEADER.size)
+    if vertices.size != 3 * points * samples:
+        raise MeshError(f"{path}: became shorter while it was read.")
+    return PointCache(vertices.reshape(samples, points, 3).astype(np.float32, copy=False), start, sampling)
 
 
 def write_pc2_to(path: Path, vertices: np.ndarray, *, start: float = 0.0, sampling: float = 1.0) -> None:
@@ -137,7 +143,12 @@ def _write(path: Path, data: MotionData) -> None:
     with atomic_files(*texts, path) as (*files, cache):
         for file, text in zip(files, texts.values(), strict=True):
             file.write_text(text, encoding="utf-8")
-        write_pc2_to(cache, data.vertices)
+        write_pc2_to(cache, data.vertices, start=data.start or 0.0)
 
 
-FORMAT = Format(read_motion=_read, write_motion=_write, named=True)
+def _holds(path: Path) -> Holds:
+    beside = next((p for p in (path.with_suffix(".obj"), path.with_suffix(".OBJ")) if p.exists()), None)
+    return obj_holds(beside) if beside else Holds()
+
+
+FORMAT = Format(read_motion=_read, write_motion=_write, named=True, holds=_holds)

@@ -9,6 +9,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.plain import read_plain
 from warpgarment.io.surface.record import NONE, Coordinates, Surface, say_left_out, worth_keeping
 
 from .data import Format, MeshData, ReadOptions
@@ -52,7 +53,7 @@ def read_ply(path: Path) -> MeshData:
         MeshError: Not a PLY file, cut short, or a face names a vertex that does not exist.
     """
     path = Path(path)
-    data = path.read_bytes()
+    data = read_plain(path)
     try:
         order, elements, body = _header(data)
         source = _Ascii(body) if order == "" else _Binary(body, order)

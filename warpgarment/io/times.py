@@ -63,7 +63,12 @@ def frames_of(samples: np.ndarray, rate: float, span: tuple[float, float] | None
             f"{count:,} frames. Repair timeCodesPerSecond or the time samples."
         )
     codes = start + step * np.arange(count)
-    return Frames(_snapped(codes, samples, step), rate / step if count > 1 else None)
+    return Frames(_snapped(codes, samples, step), _rounded(rate / step) if count > 1 else None)
+
+
+def _rounded(fps: float) -> float:
+    """A rate that differs from a whole one by the rounding of times in float32 is that one."""
+    return float(round(fps)) if abs(fps - round(fps)) < 1e-5 * fps else fps
 
 
 def _step(samples: np.ndarray, rate: float, turns: bool) -> float:

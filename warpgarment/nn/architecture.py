@@ -1,7 +1,7 @@
-"""The kinds of networks there are, and what the rest of the program asks of a kind.
+"""The kinds of networks there are, and the interface that each of them implements.
 
-`ARCHITECTURES` names the module of each kind; it is imported when a network of that kind is used. A user's own kind is
-a line more in this dict, in the user's process: docs/extending.md shows how.
+`ARCHITECTURES` names the module of each kind, imported when a network of that kind is used. Users add a kind of
+their own as one more entry of this dict, in their own process: see docs/extending.md.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     from .network import GarmentNetwork
 
 ARCHITECTURES = {"faces": "warpgarment.nn.faces", "patches": "warpgarment.nn.patches"}
-"""Modules by the `architecture` of a `NetworkConfig`; each has one object `ARCHITECTURE`."""
+"""Module of each value of `NetworkConfig.architecture`; every such module has an object `ARCHITECTURE`."""
 
 
 class GrowthError(ValueError):
-    """A network that cannot be grown to the shape wanted; says what is in the way."""
+    """A network cannot be grown to the shape wanted; the message gives the reason."""
 
 
 class Architecture(Protocol):
-    """One kind of network. Inherit from it to take over what has a default here.
+    """One kind of network. Subclasses inherit the methods that have a default here.
 
     Attributes:
-        config: Class of its settings.
-        presets: Its named shapes, for `TrainConfig.network`.
-        subsets: Whether it may see a part of a garment's faces as well as all of them. Where not, it sees all in a
-            simulation whatever `face_splits` says, and in training once garments are no longer split.
+        config: Class of the network's settings.
+        presets: Named settings, which `TrainConfig.network` can choose.
+        subsets: Whether a network may be run on some of a garment's faces. If not, a simulation always gives it all
+            faces, whatever `face_splits` is, and training does so once garments are no longer split.
     """
 
     config: type[NetworkConfig]
@@ -47,11 +47,11 @@ class Architecture(Protocol):
         ...
 
     def geometry(self, garment: Garment, config: NetworkConfig) -> Any:
-        """What a network must know of how the faces of a garment lie on the cloth, on the host: computed once."""
+        """How the faces of a garment lie on the cloth, for example geodesic distances; on the host, computed once."""
         return None
 
     def sampled(self, geometry: Any, config: NetworkConfig, device: torch.device) -> Any:
-        """The same in a form that training draws many random subsets of faces from; for `rows`."""
+        """The `geometry` in a form from which `rows` quickly takes many random subsets of faces, in training."""
         return geometry
 
     def rows(
@@ -61,38 +61,38 @@ class Architecture(Protocol):
         device: torch.device,
         scale: Sequence[float] | np.ndarray | None = None,
     ) -> Any:
-        """What `forward_normalised` is given as `rows`.
+        """The argument `rows` of `forward_normalised`.
 
         Args:
-            shown: Of each row its garment's `geometry`, and its faces in their order, None for all. One entry serves
-                all rows of a batch that is one garment many times.
+            shown: For each row, the `geometry` of its garment and the indices of its faces in their order; None for
+                all faces. A single entry serves all rows of a batch that repeats one garment.
             config: Settings of the network.
-            device: Where tensors go.
-            scale: Factor of the lengths of each row; None: 1.
+            device: Device of the result.
+            scale: Factor by which the lengths of each row are multiplied; None for 1.
         """
         return None
 
     def entries(self, garment: Garment, faces: int, config: NetworkConfig) -> int:
-        """Numbers that `rows` holds for a row of so many faces: limits how many rows share a call of the network."""
+        """Number of entries of `rows` for one row of `faces` faces; it limits the rows in one call of the network."""
         return 0
 
     def alike(self, garment: Garment) -> Hashable:
-        """Rows share a call only where this is the same for their garments."""
+        """A key of the garment; only rows whose garments have equal keys share a call of the network."""
         return None
 
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
         """Bytes that a simulation needs for the network, by purpose.
 
-        What lasts is added up. Of "network" and "making weights", which are needed in passing, and of what other stages
-        need in passing, only the largest counts.
+        The entries "network" and "making weights" are temporary: only the largest of them, and of the temporary memory
+        of other stages, counts. All other entries last for the whole simulation and are added up.
         """
         ...
 
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: Any) -> tuple[int, int]:
-        """Operations of the forward pass for one row, see flops.py.
+        """Number of operations of the forward pass for one row, see flops.py.
 
         Returns:
-            Those of products both of whose factors need a gradient, and those of the others.
+            Operations of products both of whose factors need a gradient, and operations of all other products.
         """
         ...
 
@@ -102,13 +102,13 @@ class Architecture(Protocol):
         """The network that a training starts from.
 
         Args:
-            network: A trained one.
-            config: Shape wanted, of this kind.
-            grow: Whether the network is to have that shape and predict what the given one does.
+            network: A trained network.
+            config: The shape wanted, of this kind.
+            grow: Whether the result has that shape and predicts the same as `network`.
             seed: Seed for weights that are initialised at random.
 
         Raises:
-            GrowthError: It cannot be grown to that shape.
+            GrowthError: The network cannot be grown to that shape.
         """
         if grow:
             raise GrowthError(
@@ -119,20 +119,20 @@ class Architecture(Protocol):
 
 
 def architecture(name: str) -> Architecture:
-    """The kind of network of a name.
+    """The kind of network with a name.
 
     Raises:
-        ValueError: There is none of that name.
+        ValueError: No kind has that name.
     """
     check_name(name)
     return importlib.import_module(ARCHITECTURES[name]).ARCHITECTURE
 
 
 def check_name(name: str) -> None:
-    """Refuses a name that is none of `ARCHITECTURES`.
+    """Checks that a name is in `ARCHITECTURES`.
 
     Raises:
-        ValueError: Names those there are.
+        ValueError: It is not; the message lists the known names.
     """
     if name not in ARCHITECTURES:
         *others, last = (f'"{known}"' for known in ARCHITECTURES)
@@ -146,10 +146,10 @@ def build_network(config: NetworkConfig) -> GarmentNetwork:
 
 
 def preset(name: str) -> NetworkConfig:
-    """The settings of a named shape, of whichever kind.
+    """The settings of a named shape, looked up in the presets of all kinds.
 
     Raises:
-        ValueError: There is none of that name.
+        ValueError: No kind has a preset of that name.
     """
     presets: dict[str, NetworkConfig] = {}
     for kind in ARCHITECTURES:

@@ -1,12 +1,12 @@
 """Manifold-aware self-attention (section 4.3, equation 1) and the encoder layer around it.
 
-Of `heads` heads, the last `manifold_heads` do not compare queries with keys: their attention matrix is given,
+Of `heads` heads, the last `manifold_heads` do not compare queries with keys: their attention matrix is fixed,
 
     A = softmax(-(D/r)^p)        D geodesic distances between face centroids, r radius, p power
 
-so a face listens to the faces near it *on the cloth*, whatever lies near it in space. The other heads are ordinary.
+so a face attends to the faces near it *on the cloth*, whatever lies near it in space. The other heads are ordinary.
 
-Tokens are N faces followed by C velocity tokens. In a manifold head faces listen to faces, a velocity token to itself.
+Tokens are N faces followed by C velocity tokens. In a manifold head faces attend to faces, a velocity token to itself.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ class Spreading(Protocol):
         """Number of faces N."""
 
     def spread(self, value: torch.Tensor) -> torch.Tensor:
-        """Weights times values, [R,N,K] -> [R,N,K]; R may be one where the values' is not."""
+        """Weights times values, [R,N,K] -> [R,N,K]; weights of one row apply to all rows of values."""
 
 
 def geodesic_weights(distances: torch.Tensor, radius: float, power: float) -> torch.Tensor:
     """Attention weights of the manifold heads, softmax(-(D/r)^p) along rows (equation 1).
 
     Args:
-        distances: Geodesic distances between face centroids [m], shape [...,N,N]; inf where there is no way.
+        distances: Geodesic distances between face centroids [m], shape [...,N,N]; inf between components.
         radius: r [m]. A large power makes the weights a ball of this radius, a small one a smooth decay.
-        power: p.
+        power: p, without unit.
 
     Returns:
-        Shape [...,N,N], finite. Rows sum to one; a row whose distances are all inf (a padded one) is zero.
+        Weights, shape [...,N,N], finite. Rows sum to one; a row whose distances are all inf (padding) is zero.
     """
-    score = -((distances / radius) ** power)  # may overflow to -inf, which is weight 0 and right
+    score = -((distances / radius) ** power)  # may overflow to -inf, whose weight is correctly 0
     score = torch.where(torch.isinf(distances), -math.inf, score)  # inf ** power is 1 for a power that rounds to 0
     highest = score.amax(dim=-1, keepdim=True)
     weight = torch.exp(score - torch.where(torch.isinf(highest), 0.0, highest))
@@ -54,14 +54,14 @@ def geodesic_weights(distances: torch.Tensor, radius: float, power: float) -> to
 class ManifoldAwareAttention(nn.Module):
     """Multi-head self-attention, some of whose heads use fixed geodesic weights.
 
-    Queries, keys, values and the output are projected for all heads, as in the paper's count of parameters; the query
-    and key rows of the manifold heads lie first in `qkv` and are skipped, since nothing is compared there.
+    Queries, keys, values and the output have projections for all heads, as in the paper's count of parameters. The rows
+    of `qkv` for queries and keys of the manifold heads come first and are not used, since these heads compare nothing.
 
     Args:
         embedding: Width of a token.
         heads: Number of heads; divides `embedding`.
-        manifold_heads: How many of them use the geodesic weights.
-        dropout: Dropout of the learned attention weights.
+        manifold_heads: Number of heads that use the geodesic weights.
+        dropout: Dropout rate of the learned attention weights.
     """
 
     def __init__(self, embedding: int, heads: int, manifold_heads: int, dropout: float) -> None:
@@ -77,15 +77,15 @@ class ManifoldAwareAttention(nn.Module):
     def forward(
         self, x: torch.Tensor, weights: torch.Tensor | Spreading, key_mask: torch.Tensor | None
     ) -> torch.Tensor:
-        """Attends.
+        """Applies the attention to tokens.
 
         Args:
             x: Tokens, shape [B,T,E], faces first.
-            weights: Geodesic weights, shape [B,N,N], or [1,N,N] where all the batch shares one garment; or pooled.
+            weights: Geodesic weights, shape [B,N,N], or [1,N,N] if the whole batch is one garment; or a `Spreading`.
             key_mask: True where a token is real, shape [B,1,1,T]; None where all are.
 
         Returns:
-            Shape [B,T,E].
+            Tokens, shape [B,T,E].
         """
         batch, tokens, embedding = x.shape
         width_manifold = self.manifold_heads * self.head_width
@@ -109,9 +109,9 @@ class ManifoldAwareAttention(nn.Module):
 
 
 def _spread(weights: torch.Tensor | Spreading, value: torch.Tensor) -> torch.Tensor:
-    """Weights times the values of the faces, the values of velocity tokens as they are; [B,N,N], [B,T,K] -> [B,T,K].
+    """Weights times the values of faces; values of velocity tokens are kept. [B,N,N], [B,T,K] -> [B,T,K].
 
-    All manifold heads share their weights, so they are one product; and so is a batch that shares one garment.
+    All manifold heads share their weights, so one product serves them all, and also a batch of one garment.
     """
     if not isinstance(weights, torch.Tensor):
         return torch.cat([weights.spread(value[:, : weights.faces]), value[:, weights.faces :]], dim=1)
@@ -133,9 +133,9 @@ class EncoderLayer(nn.Module):
         embedding: Width of a token.
         feed_forward: Width of the feed-forward layer.
         heads: Number of heads.
-        manifold_heads: How many of them use the geodesic weights.
-        dropout: Dropout, in training.
-        norm_first: Pre-norm instead of post-norm.
+        manifold_heads: Number of heads that use the geodesic weights.
+        dropout: Dropout rate in training.
+        norm_first: Whether to normalise before each sublayer (pre-norm), not after it (post-norm).
         activation: "relu" or "gelu".
     """
 

@@ -1,4 +1,4 @@
-"""Bounds of what a checkpoint may say about itself, checked before memory is asked for."""
+"""Bounds on the metadata of a checkpoint, checked before any memory is allocated."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 from warpgarment.errors import CheckpointError
 
-LONGEST = 16 << 20  # characters of a JSON text
-DEEPEST = 64  # objects and arrays within each other
-LARGEST = {  # of settings that are whole numbers; the paper's network has 512, 512, 8, 8 and 10
+LONGEST = 16 << 20  # most characters of a JSON text
+DEEPEST = 64  # most nested objects and arrays
+LARGEST = {  # largest values of integer settings; the paper's network has 512, 512, 8, 8, 2 and 10
     "embedding": 16_384,
     "feed_forward": 65_536,
     "layers": 512,
@@ -21,7 +21,7 @@ LARGEST = {  # of settings that are whole numbers; the paper's network has 512, 
     "face_feed_forward": 65_536,
     "face_layers": 512,
 }
-LARGEST_OTHER = 1_000_000_000  # of any other number
+LARGEST_OTHER = 1_000_000_000  # largest value of any other number
 
 
 def checked_json(path: object, what: str, text: str) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def checked_json(path: object, what: str, text: str) -> dict[str, Any]:
         text: The text itself.
 
     Raises:
-        CheckpointError: It is longer or more deeply nested than the bounds, or no JSON object.
+        CheckpointError: The text is longer or more deeply nested than the bounds, or is not a JSON object.
     """
     if len(text) > LONGEST:
         raise CheckpointError(f"{path}: {what} has {len(text):,} characters, more than {LONGEST:,}; do not use it")
@@ -55,11 +55,11 @@ def checked_json(path: object, what: str, text: str) -> dict[str, Any]:
 
 
 def check_settings(path: object, settings: Mapping[str, Any], tensors: int) -> None:
-    """Refuses settings of a network that no file with so few tensors can hold, or that nothing could run.
+    """Checks that settings of a network are within the bounds, and that its layers can be in so few tensors.
 
     Args:
         path: The checkpoint, for messages.
-        settings: Settings by name; those that are not numbers are left alone.
+        settings: Settings by name; those that are not numbers are not checked.
         tensors: Number of tensors in the checkpoint.
 
     Raises:

@@ -1,9 +1,9 @@
 """Checkpoints: safetensors that hold the weights, the statistics and, as JSON, the `NetworkConfig`.
 
-One file, or a folder of shards with an index (`shards.py`). Metadata keys: `kind` ("warpgarment.network"),
-`format_version`, `config`, `notes`, a JSON object for whatever a training run wants to say about itself, and `format`
-("pt"), without which the Hugging Face Hub's tools refuse a file; older checkpoints have `kind` in its place. Nothing in
-a checkpoint is executed when it is read.
+One file, or a folder of shards with an index (`shards.py`). Its metadata have the keys `kind` ("warpgarment.network"),
+`format_version`, `config`, `notes` (a JSON object of any facts about the training run) and `format` ("pt", without
+which the tools of the Hugging Face Hub refuse a file; in older checkpoints it holds the value of `kind`). Nothing in a
+checkpoint is executed when it is read.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 KIND = "warpgarment.network"
 FORMAT_VERSION = 1
 WEIGHTS = Path(__file__).parents[1] / "assets" / "weights"  # networks that ship with the package
-FIRST = {  # settings that all checkpoints have; those that came later, or with a kind of network, have their defaults
+FIRST = {  # settings that every checkpoint must have; a missing later one takes its default
     "embedding",
     "layers",
     "feed_forward",
@@ -60,19 +60,20 @@ def save(
     notes: Mapping[str, object] | None = None,
     max_shard_bytes: int | None = None,
 ) -> None:
-    """Writes a checkpoint: beside its place, then renamed, so that nobody reads half of one.
+    """Writes a checkpoint under a temporary name and renames it, so that nobody reads an incomplete one.
 
     Args:
-        network: What to write.
+        network: The network to write.
         path: A file, or with `max_shard_bytes` a folder.
-        dtype: Of the weights in the file, float32 (None), bfloat16 or float16; statistics are always float32.
-        notes: Anything JSON can hold, kept in the metadata.
-        max_shard_bytes: Write a folder with an index, in the Hugging Face layout, no file of which is larger.
+        dtype: Type of the weights in the file: float32 (None), bfloat16 or float16; statistics are always float32.
+        notes: Facts about the network that JSON can hold, stored in the metadata.
+        max_shard_bytes: Largest size of a file [bytes]; a folder with an index is written, in the layout of Hugging
+            Face. None writes a single file.
 
     Raises:
         CheckpointError: A weight or statistic is not finite.
-        ValueError: Another dtype, or a tensor that is larger than a shard may be.
-        FileExistsError: The folder holds something else than a checkpoint.
+        ValueError: The dtype is another one, or a tensor is larger than a shard may be.
+        FileExistsError: The folder holds something other than a checkpoint.
     """
     dtype = dtype or torch.float32
     if dtype not in _DTYPES:
@@ -102,19 +103,19 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
 
     Args:
         path: A file or folder that `save` wrote.
-        device: Where the network goes; the CPU unless said otherwise.
+        device: Device of the network; None for the CPU.
 
     Returns:
-        The network, of the kind its config says, in float32 and in evaluation mode.
+        The network, of the kind that its config names, in float32 and in evaluation mode.
 
     Raises:
-        CheckpointError: No file, a truncated or foreign one, shards that do not belong together, or settings or tensors
-            that do not fit; says which.
+        CheckpointError: There is no file, it is truncated or of another format, shards do not belong together, or
+            settings or tensors do not fit; the message says which.
     """
     contents = shards.contents(path)
     path = contents.path
     config, _ = _described(contents)
-    with torch.device("meta"):  # shapes alone: nothing is allocated for a config that the file does not bear out
+    with torch.device("meta"):  # only shapes: nothing is allocated before the tensors of the file have these shapes
         network = build_network(config)
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     _check_tensors(path, expected, contents.shapes)
@@ -135,25 +136,25 @@ def read_metadata(path: str | os.PathLike[str]) -> tuple[NetworkConfig, dict[str
     """The settings and the notes of a checkpoint, file or folder, without its weights.
 
     Raises:
-        CheckpointError: As `load`.
+        CheckpointError: As for `load`.
     """
     return _described(shards.contents(path))
 
 
 def find(name: str | os.PathLike[str], *, device: torch.device | str | None = None) -> Path:
-    """The checkpoint of a name. What lies at a path of that name wins over what ships, and that over the Hub.
+    """Finds a checkpoint by name: first as a path, then among the networks that ship, then on the Hugging Face Hub.
 
     Args:
         name: A checkpoint file, or a folder that holds one; "default" or the name of a network that ships; or a
             repository of the Hugging Face Hub, `owner/name` or `owner/name@revision`, which is fetched.
-        device: Where it is going to run, which decides what "default" is: on a GPU `base`, where that ships, else what
-            default.txt among the weights names. None: a GPU where there is one, as in `Simulator`.
+        device: Device on which the network will run. It decides what "default" is: on a GPU `base` if that ships,
+            otherwise the name in default.txt beside the weights. None takes a GPU if there is one, as in `Simulator`.
 
     Returns:
         A file, or a folder of shards.
 
     Raises:
-        CheckpointError: There is none, or several; says what there is and what was tried.
+        CheckpointError: There is none, or several; the message says what there is and what was tried.
         MissingExtra: It can only be a repository, and huggingface-hub is not installed.
     """
     if Path(name).exists():
@@ -176,13 +177,13 @@ def find(name: str | os.PathLike[str], *, device: torch.device | str | None = No
 
 
 def _shipped() -> dict[str, Path]:
-    """Networks of the package by name: files, and folders of shards."""
+    """Networks that ship with the package, by name: files, and folders of shards."""
     files = {file.stem: file for file in WEIGHTS.glob("*.safetensors")}
     return files | {index.parent.name: index.parent for index in WEIGHTS.glob(f"*/{shards.INDEX}")}
 
 
 def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
-    # only the kind of device counts here: whether there is one is found out by who runs the network
+    # only the kind of device counts here: the caller that runs the network checks that there is one
     if device is None:
         gpu = torch.cuda.is_available()
     else:
@@ -238,7 +239,7 @@ def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
     for name, value in settings.items():
         kind = type(fields[name].default)
         if kind is tuple and isinstance(value, list) and all(isinstance(part, str) for part in value):
-            settings[name] = value = tuple(value)  # of which JSON has none
+            settings[name] = value = tuple(value)  # JSON has no tuples
         fits = isinstance(value, (int, float)) if kind is float else isinstance(value, kind)
         if not fits or (isinstance(value, bool) and kind is not bool):
             raise CheckpointError(f"{path}: setting {name} must be {kind.__name__}, got {value!r}")

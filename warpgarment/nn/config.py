@@ -11,7 +11,7 @@ from warpgarment.kernels.features.channels import FACE
 from .architecture import check_name
 from .attention import ACTIVATIONS
 
-CHANNELS = (  # those of the first networks: what a checkpoint that names none reads
+CHANNELS = (  # channels of the first networks, which a checkpoint that names no channels reads
     "deformation_gradient",
     "normal",
     "centroid",
@@ -38,7 +38,7 @@ STATISTICS = {  # buffers of the normalisation and their lengths, for networks o
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:
-    """Everything that is not a weight. The defaults are the paper's."""
+    """Settings of a network. The defaults are the paper's."""
 
     embedding: int = 512
     layers: int = 8
@@ -50,17 +50,17 @@ class NetworkConfig:
     geodesic_power: float = 20.0
     geodesic_radius: float = 1.0  # metres
     residual: bool = False  # see parametrisation.py
-    replace_singular_values: bool = True  # of Psi Phi by the predicted ones (section 4.3.1); an ablation leaves them
+    replace_singular_values: bool = True  # of Psi Phi by Sigma (section 4.3.1); False in an ablation
     heading: str = "world"  # or "canonical", see heading.py
     norm_first: bool = False
     activation: str = "relu"  # or "gelu"
-    fps: float = 30.0  # of the motions it was trained on
-    architecture: str = "faces"  # every face a token; or "patches", see patches/network.py, to which alone belong:
-    patch_spacing: float = 0.08  # metres between patches; `embedding` and `feed_forward` are those of their tokens
-    face_embedding: int = 128
+    fps: float = 30.0  # frames per second of the motions it was trained on
+    architecture: str = "faces"  # every face is a token; or "patches", see patches/network.py
+    patch_spacing: float = 0.08  # metres between patches; this and the next three are settings of "patches" alone
+    face_embedding: int = 128  # width of a face; `embedding` and `feed_forward` are widths of patches
     face_feed_forward: int = 128
-    face_layers: int = 2  # after the patches have been heard; one more goes before
-    channels: tuple[str, ...] = CHANNELS  # what it reads of a face in a frame, of kernels/features/channels.py
+    face_layers: int = 2  # number of face layers after the patches; there is one more before them
+    channels: tuple[str, ...] = CHANNELS  # features of a face that the network reads, see kernels/features/channels.py
 
     def __post_init__(self) -> None:
         for name in ("embedding", "layers", "feed_forward", "heads", "face_embedding", "face_feed_forward"):
@@ -90,11 +90,11 @@ class NetworkConfig:
 
     @property
     def features(self) -> int:
-        """Numbers that the network reads of a face in a frame: 34 of today's channels."""
+        """Number of features of a face in a frame that the network reads: 34 with the default channels."""
         return FACE.only(self.channels).width
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, as files hold them; `channels` only where it differs from what all networks read at first."""
+        """Settings as plain values, for a checkpoint; without `channels` if these are the default `CHANNELS`."""
         values = dataclasses.asdict(self)
         if self.channels == CHANNELS:
             del values["channels"]
@@ -102,12 +102,12 @@ class NetworkConfig:
 
     @classmethod
     def base(cls, **changes: Any) -> NetworkConfig:
-        """The paper's network, 12.8 million parameters."""
+        """The paper's network with 12.8 million parameters."""
         return cls(**changes)
 
     @classmethod
     def small(cls, **changes: Any) -> NetworkConfig:
-        """A network for one CPU core, 0.5 million parameters."""
+        """A network of faces for one CPU core, with 0.5 million parameters."""
         settings: dict[str, Any] = {
             "embedding": 128,
             "layers": 4,
@@ -125,7 +125,7 @@ class NetworkConfig:
 
     @classmethod
     def fast(cls, **changes: Any) -> NetworkConfig:
-        """A network of patches for real time on one CPU core."""
+        """A network of patches for real time on one CPU core, with 0.7 million parameters."""
         settings: dict[str, Any] = {
             "architecture": "patches",
             "embedding": 128,

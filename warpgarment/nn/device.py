@@ -1,4 +1,4 @@
-"""The device that a user names, or the one that is taken where nobody names one."""
+"""The device that a user names, or the default one."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from warpgarment.errors import UsageError
 
 
 def device_of(name: torch.device | str | None) -> torch.device:
-    """The device of a name, with a number where it is a GPU.
+    """The device with a name; a GPU always has an index.
 
     Args:
-        name: "cpu", "cuda", "cuda:0", ...; None takes a GPU where there is one.
+        name: "cpu", "cuda", "cuda:0", ...; None takes a GPU if there is one.
 
     Raises:
-        UsageError: Not a name of this kind, or there is no such GPU.
+        UsageError: The name is of another kind, or there is no such GPU.
     """
     if name is None or name == "":
         name = "cuda" if torch.cuda.is_available() else "cpu"

@@ -1,9 +1,9 @@
-"""Arithmetic of a training step, and what a device could do at best.
+"""Number of operations of a training step, and the peak rate of devices.
 
-Counted are the matrix products that the method needs, two operations for each multiplication with its addition, in the
-custom of "model FLOPs": nothing for layer norms, activations and softmax, and nothing twice where an implementation
-computes something again in the backward pass. For a sample of N faces and C components, T = N + C tokens, H frames of
-history, width E, feed-forward width W, L layers, of whose h heads m use geodesic weights (M = m E / h, their width):
+Only the matrix products that the method needs are counted, with two operations for each multiplication and addition, as
+is usual for "model FLOPs". Layer norms, activations and softmax are not counted, nor are values that an implementation
+computes again in the backward pass. For a sample of N faces and C components, T = N + C tokens, H frames of history,
+width E, feed-forward width W and L layers, in which m of h heads use geodesic weights (of width M = m E / h together):
 
     embedding        2 N (34 H) E + 2 C 3 (H - 1) E
     layer:
@@ -14,10 +14,10 @@ history, width E, feed-forward width W, L layers, of whose h heads m use geodesi
       feed-forward   4 T E W
     heads            2 N E 12 + 2 C E 3
 
-Each kind of network counts its own, in `Architecture.flops`; those of patches are in patches/architecture.py.
+Each kind of network counts its own operations in `Architecture.flops`; see patches/architecture.py for patches.
 
-The backward pass is two products for each of the forward pass, one for each factor's gradient, but one only where a
-factor needs no gradient: the embeddings' inputs and the geodesic weights.
+The backward pass has two products for each product of the forward pass, one for the gradient of each factor, but only
+one if a factor needs no gradient, as the inputs of the embeddings and the geodesic weights.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PEAKS = (  # part of the device's name, dense bfloat16 with float32 sums [FLOP/s
 
 
 def layer_flops(config: NetworkConfig, nodes: int, components: int) -> tuple[int, int]:
-    """Of all encoder layers on faces or patches, and the components: with two gradients, with one."""
+    """Operations of all encoder layers on faces or patches and components: of products with two gradients, with one."""
     e, tokens = config.embedding, nodes + components
     manifold = config.manifold_heads * (e // config.heads)
     layer = 2 * tokens * e * (3 * e - 2 * manifold) + 4 * tokens**2 * (e - manifold)
@@ -55,31 +55,31 @@ def layer_flops(config: NetworkConfig, nodes: int, components: int) -> tuple[int
 
 
 def step_flops(config: NetworkConfig, samples: int, faces: int, components: int, rows: Any = None) -> int:
-    """Operations of a training step, forward and backward, see above; `rows` are those the network is given."""
+    """Operations of a training step, forward and backward, see above; `rows` is the argument of the network."""
     both, one = architecture(config.architecture).flops(config, faces, components, rows)
     return samples * (3 * both + 2 * one)
 
 
 def work(config: NetworkConfig, views: Iterable[tuple[int, int, int, Any]]) -> int:
-    """Operations of a training step that shows the network each of these views once.
+    """Operations of a training step in which the network runs once on each view.
 
     Args:
-        config: Of the network.
-        views: Of each call of the network: number of rows, of faces and of components of a row, and what it is given of
-            the layout of the faces, from `Architecture.rows`.
+        config: Settings of the network.
+        views: For each call of the network, the number of rows, the numbers of faces and of components of a row, and
+            the result of `Architecture.rows`.
     """
     return sum(step_flops(config, *view) for view in views)
 
 
 def matrix_peak(device: torch.device, precision: str) -> float | None:
-    """Most operations per second that a device can do in bfloat16; None where that is not known, or in float32."""
+    """Peak rate of a device in bfloat16 [FLOP/s]; None if it is not known, and for float32."""
     if device.type != "cuda" or precision != "bfloat16":
         return None
     return peak_of(torch.cuda.get_device_name(device))
 
 
 def peak_of(name: str) -> float | None:
-    """The same by the device's name; None for a slice of a device (MIG)."""
+    """Peak rate in bfloat16 [FLOP/s] of a device of this name; None if unknown, and for a slice of a device (MIG)."""
     words = f" {name} ".replace("-", " ")
     found = (peak for part, peak in PEAKS if f" {part} " in words)
     return None if "MIG" in name else next(found, None)

@@ -1,7 +1,7 @@
-"""Takes the garment's heading out of what the network sees, and puts it back into what it says.
+"""Removes the garment's heading from the inputs of the network, and adds it to its output.
 
-Cloth behaves the same whichever way its wearer faces: turning everything about the vertical (+Y) turns the answer.
-With `heading="canonical"` the network need not learn that. The yaw of the newest frame,
+Cloth behaves the same whichever way its wearer faces: turning everything about the vertical (+Y) turns the motion.
+With `heading="canonical"` the network need not learn this symmetry. The yaw of the newest frame,
 
     theta = argmax_t tr(R_y(t)^T M) = atan2(M02 - M20, M00 + M22),    M = mean over faces of the deformation gradient,
 
@@ -22,11 +22,11 @@ def yaw(deformation_gradient: torch.Tensor, face_mask: torch.Tensor | None = Non
     """The heading of each garment about +Y.
 
     Args:
-        deformation_gradient: Of the newest frame, shape [B,N,3,3].
+        deformation_gradient: Deformation gradients of the newest frame, shape [B,N,3,3].
         face_mask: True where a face is real, shape [B,N]; None where all are.
 
     Returns:
-        Angle [rad], shape [B]; zero where the garment has no heading (as many faces one way as the other).
+        Angle [rad], shape [B]; zero for a garment without a heading, where the sum of the gradients has no yaw.
     """
     if face_mask is not None:
         deformation_gradient = torch.where(face_mask[..., None, None], deformation_gradient, 0.0)
@@ -42,14 +42,14 @@ def rotation_about_up(angle: torch.Tensor) -> torch.Tensor:
 
 
 def canonical_frame(face_features: torch.Tensor, face_mask: torch.Tensor | None = None) -> torch.Tensor:
-    """The rotation G = R_y(-yaw) that takes each garment to the heading the network knows.
+    """The rotation G = R_y(-yaw) that turns each garment to heading zero.
 
     Args:
         face_features: Stacked features, oldest first, shape [B,N,H*34].
         face_mask: True where a face is real, shape [B,N]; None where all are.
 
     Returns:
-        Shape [B,3,3].
+        Rotations, shape [B,3,3].
     """
     newest = face_features[..., -FEATURES:]
     phi = newest[..., LAYOUT["deformation_gradient"]].unflatten(-1, (3, 3))
@@ -61,11 +61,11 @@ def rotate_features(face_features: torch.Tensor, frame: torch.Tensor, rest: torc
 
     Args:
         face_features: Stacked features, shape [B,N,H*34].
-        frame: Rotation per garment, shape [B,3,3].
-        rest: Rotation of its rest pose, shape [B,3,3]; None: it is not turned.
+        frame: Rotation of each garment and its body, shape [B,3,3].
+        rest: Rotation of each rest pose, shape [B,3,3]; None if it is not turned.
 
     Returns:
-        Shape [B,N,H*34].
+        Features, shape [B,N,H*34].
     """
     per_frame = face_features.reshape(len(face_features), -1, FEATURES)
     return torch.bmm(per_frame, FACE.turn(frame, rest).mT).reshape(face_features.shape)

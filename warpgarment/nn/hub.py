@@ -1,7 +1,7 @@
 """Networks from the Hugging Face Hub: `owner/name`, or `owner/name@revision` for a branch, a tag or a commit.
 
-Only weights, their index and pages are fetched, into the Hub's own cache: no code, and nothing that is pickled. To
-publish a network, save it to a folder, put its card there as README.md, and let the Hub's command line upload it:
+Only weights, their index and Markdown pages are fetched, into the Hub's own cache: no code, and no pickled files. To
+publish a network, save it to a folder, put its card there as README.md, and upload it with the Hub's command line:
 
     checkpoint.save(network, "base", dtype=torch.bfloat16, max_shard_bytes=16 * 2**20)
     hf upload owner/name base                                  # huggingface-cli upload, in versions before 0.34
@@ -17,12 +17,12 @@ from warpgarment.errors import CheckpointError, MissingExtra
 from .shards import INDEX
 
 WANTED = ("*.safetensors", INDEX, "*.md")
-UNWANTED = ("*/*",)  # whatever lies in folders of the repository
+UNWANTED = ("*/*",)  # everything in subfolders of the repository
 _NAME = re.compile(r"(?!.*\.\.)(\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?", re.ASCII)
 
 
 def is_repository(name: str) -> bool:
-    """Whether a name reads like a repository's: not a path of another depth, nor one of a checkpoint file."""
+    """Whether a name has the form of a repository's: not that of a deeper path, or of a checkpoint file."""
     return bool(_NAME.fullmatch(name)) and not name.endswith(".safetensors")
 
 
@@ -30,8 +30,8 @@ def fetch(name: str, tried: str) -> Path:
     """Downloads a repository, or finds it in the Hub's cache.
 
     Args:
-        name: For which `is_repository` holds.
-        tried: What the name turned out not to be, as the start of an error's sentence.
+        name: A name for which `is_repository` is true.
+        tried: The places where the name was not found, as the first words of an error message.
 
     Returns:
         The folder of its files.

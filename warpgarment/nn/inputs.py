@@ -1,4 +1,4 @@
-"""What networks are given and what they answer, in a simulation and row by row."""
+"""Inputs and outputs of networks, for a whole batch in a simulation and for padded rows."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ class FrameInputs(NamedTuple):
     body: torch.Tensor  # [U,3] frame t [m]
     next_body: torch.Tensor  # [U,3] frame t+1 [m]
     previous: torch.Tensor | None = None  # [V,3] frame t-1 [m]
-    materials: torch.Tensor | None = None  # [B,M] fields of `Material` in their order
-    wind: torch.Tensor | None = None  # [B,3] m/s
+    materials: torch.Tensor | None = None  # [B,M] the fields of `Material`, in their order
+    wind: torch.Tensor | None = None  # [B,3] velocity of the air [m/s]
     pairs: torch.Tensor | None = None  # int32 [P,2] vertices of different garments that are near each other
 
 
 class VertexStep(NamedTuple):
-    """What a network answers that moves vertices itself; `parametrisation.Step` is the answer by faces."""
+    """Output of a network that predicts positions of vertices; `parametrisation.Step` is the output per face."""
 
     positions: torch.Tensor  # [V,3] the next frame before contact [m]; no Poisson system is solved
 
 
 class RowInputs(NamedTuple):
-    """R rows of at most N faces and C components, each row a garment or a part of its faces, in physical units."""
+    """R rows of at most N faces and C components, in physical units. A row is a garment or a part of its faces."""
 
     features: torch.Tensor  # [R,N,H*K] oldest first, all channels
     velocities: torch.Tensor  # [R,C,(H-1)*3] m/frame
-    rows: Any  # of `Architecture.rows`
+    rows: Any  # the result of `Architecture.rows`
     face_mask: torch.Tensor | None = None  # bool [R,N], True where a face is real; None where all are
     component_mask: torch.Tensor | None = None  # bool [R,C]
-    turn: torch.Tensor | None = None  # [R,3,3] of the world, on top of what the network's heading asks for; None: none
-    rest_turn: torch.Tensor | None = None  # [R,3,3] of the rest pose
+    turn: torch.Tensor | None = None  # [R,3,3] rotation of the world, applied after that to the network's heading
+    rest_turn: torch.Tensor | None = None  # [R,3,3] rotation of the rest pose
     mirrored: torch.Tensor | None = None  # bool [R], which rows are mirrored in x, after the turns
-    in_network_frame: bool = False  # turned and mirrored already, and so is the target
+    in_network_frame: bool = False  # inputs and target are already turned and mirrored
 
 
 class NormalisedOutput(NamedTuple):
@@ -57,9 +57,9 @@ class NormalisedOutput(NamedTuple):
 
 
 class NetworkSizes(NamedTuple):
-    """A simulation whose memory is to be predicted."""
+    """The figures of a simulation from which the memory of its network is predicted."""
 
-    garments: Sequence[Garment]  # one that occurs several times shares what is constant
+    garments: Sequence[Garment]  # in the order of the batch; equal objects share their constants
     face_splits: int = 1
-    half: bool = False  # bfloat16
-    cpu: bool = True
+    half: bool = False  # whether the network runs in bfloat16
+    cpu: bool = True  # whether the device is a CPU

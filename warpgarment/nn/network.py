@@ -1,8 +1,8 @@
-"""What all networks have in common: statistics, rows of garments, one frame of a simulation, files.
+"""The base class of all networks: statistics, rows of garments, one frame of a simulation, files.
 
-A kind of network differs in `forward_normalised`, which maps normalised inputs to normalised outputs; run.py does what
-is around that. One that answers otherwise than face by face has a `layout` and a `predict` of its own. What Psi, Sigma
-and q mean is in parametrisation.py. Statistics are buffers and travel with the weights.
+Each kind of network defines `forward_normalised`, which maps normalised inputs to normalised outputs; run.py does
+everything around it. A network whose output is not one step per face also defines `layout` and `predict`. The meaning
+of Psi, Sigma and q is in parametrisation.py. Statistics are buffers, so checkpoints hold them with the weights.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ class GarmentNetwork(nn.Module):
     zero, so that, untrained, it moves the garment like skin. `set_statistics` keeps those means.
 
     Args:
-        config: Its shape and settings.
+        config: Shape and settings of the network.
 
     Attributes:
-        reads: Those of `previous`, `materials`, `wind` and `pairs` of `FrameInputs` that `predict` needs.
+        reads: Names of the optional fields of `FrameInputs` that `predict` needs: `previous`, `materials`, `wind`,
+            `pairs`.
     """
 
     reads: ClassVar[frozenset[str]] = frozenset()
@@ -67,7 +68,7 @@ class GarmentNetwork(nn.Module):
         self.singular_value_mean.fill_(1.0)
 
     def encoder_layers(self) -> nn.ModuleList:
-        """The encoder over tokens of `config.embedding`, untrained."""
+        """Untrained encoder layers on tokens of width `config.embedding`."""
         config = self.config
         return nn.ModuleList(
             EncoderLayer(
@@ -98,40 +99,40 @@ class GarmentNetwork(nn.Module):
         face_mask: torch.Tensor | None = None,
         velocity_mask: torch.Tensor | None = None,
     ) -> NetworkOutput:
-        """Physical units and world space in and out.
+        """Runs the network on rows of garments; inputs and outputs are in physical units and world space.
 
         Args:
             face_features: Stacked features, oldest first, shape [B,N,H*34].
             velocities: Past velocities of each component [m/frame], oldest first, shape [B,C,(H-1)*3].
-            weights: What the network must know of how the faces lie on the cloth: of a `ManifoldAwareTransformer` the
-                geodesic weights [B,N,N], zero in padded columns; of a `PatchTransformer` a `PatchLayout`. B may be 1
-                for a batch of one garment many times.
+            weights: How the faces lie on the cloth: for a `ManifoldAwareTransformer` the geodesic weights [B,N,N], zero
+                in padded columns; for a `PatchTransformer` a `PatchLayout`. B may be 1 if all rows are of one garment.
             face_mask: True where a face is real, shape [B,N]; None where all are.
             velocity_mask: True where a component is real, shape [B,C]; None where all are.
 
         Returns:
-            To be read by `parametrisation.compose`. Entries of padding mean nothing, and are finite.
+            The output, whose meaning is defined by `parametrisation.compose`. Padded entries are finite but arbitrary.
         """
         inputs = RowInputs(face_features, velocities, weights, face_mask, velocity_mask)
         return run(self, inputs).output
 
     def layout(self, garments: Sequence[Garment], packed: PackedGarments, *, face_splits: int = 1) -> Any:
-        """What `predict` needs to know of a batch, made once per simulation.
+        """The constants of a batch that `predict` needs, made once per simulation.
 
         Args:
             garments: The batch.
-            packed: The same, packed on the device.
-            face_splits: Disjoint subsets that each garment's faces are shown in, where the kind of network allows it.
+            packed: The same garments, packed on the device.
+            face_splits: Number of disjoint subsets of each garment's faces that the network sees one at a time. Ignored
+                if its `Architecture.subsets` is False.
         """
         return row_layout(packed, garments, self.config, face_splits)
 
     def predict(self, inputs: FrameInputs, layout: Any, *, bfloat16: bool = False) -> Step | VertexStep:
-        """What happens from frame t to t+1.
+        """Predicts the step from frame t to t+1.
 
         Args:
-            inputs: Frame t.
-            layout: From `layout`, a `RowLayout` here.
-            bfloat16: As in `run`.
+            inputs: The batch at frame t.
+            layout: The result of `layout`, here a `RowLayout`.
+            bfloat16: Whether the network runs in bfloat16, as in `run`.
         """
         assert isinstance(layout, RowLayout)
         features, velocities = inputs.features.flatten(1), inputs.velocities.flatten(1)
@@ -150,7 +151,7 @@ class GarmentNetwork(nn.Module):
         return x.flatten(-2)
 
     def read(self, face_features: torch.Tensor) -> torch.Tensor:
-        """Those of the features [...,H*34] that this network reads, `config.channels`; [...,H*K]."""
+        """The channels of the features [...,H*34] that this network reads (`config.channels`), shape [...,H*K]."""
         if self.channels.names == FACE.names:
             return face_features
         return FACE.take(face_features.unflatten(-1, (-1, FEATURES)), self.channels.names).flatten(-2)
@@ -173,27 +174,27 @@ class GarmentNetwork(nn.Module):
         Args:
             x: Features of the channels it reads, oldest frame first, shape [R,N,H*K].
             v: Velocities of components, shape [R,C,(H-1)*3].
-            rows: From the `rows` of its `Architecture`.
+            rows: The result of `Architecture.rows` for this kind of network.
             face_mask: True where a face is real, shape [R,N]; None where all are.
             component_mask: True where a component is real, shape [R,C]; None where all are.
 
         Returns:
-            In float32, under autocast too. Entries of padding mean nothing, and are finite.
+            The output in float32, also under autocast. Padded entries are finite but arbitrary.
         """
         raise NotImplementedError
 
     def embedded(
         self, face_features: torch.Tensor, turn: torch.Tensor | None, face_mask: torch.Tensor | None
     ) -> torch.Tensor | None:
-        """A short cut: the first layer's answer to features in world space, with turn and normalisation folded into it.
+        """The first layer applied to features in world space, with turn and normalisation folded into its weights.
 
         Args:
             face_features: All channels, physical units, shape [R,N,H*K].
-            turn: Rotation to the network's frame, shape [R,3,3]; None: none.
+            turn: Rotation to the network's frame, shape [R,3,3]; None for no rotation.
             face_mask: As in `forward_normalised`.
 
         Returns:
-            What `forward_embedded` takes instead of x; None, as here, where there is no short cut.
+            The argument of `forward_embedded`; None, as here, if the network has no such shortcut.
         """
         return None
 
@@ -206,7 +207,7 @@ class GarmentNetwork(nn.Module):
         face_mask: torch.Tensor | None = None,
         component_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
-        """`forward_normalised` from what `embedded` returned."""
+        """The same as `forward_normalised`, starting from the result of `embedded`."""
         raise NotImplementedError
 
     def denormalise(self, normalised: NormalisedOutput) -> NetworkOutput:
@@ -226,8 +227,8 @@ class GarmentNetwork(nn.Module):
         """Replaces statistics of the normalisation.
 
         Args:
-            statistics: Any of `STATISTICS`, with its length. Inputs in the canonical frame, targets as
-                `parametrisation.targets` gives them, also in the canonical frame.
+            statistics: Values by name, any of `STATISTICS` and of the length given there. They describe inputs in the
+                canonical frame, and targets from `parametrisation.targets` in the canonical frame.
 
         Raises:
             ValueError: An unknown name, a wrong length, a value that is not finite, a deviation that is not positive,

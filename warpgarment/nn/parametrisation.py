@@ -1,14 +1,14 @@
-"""What the network's numbers stand for: the map between its output and the step (Psi, Sigma, q) of section 4.1.
+"""The map between the output of the network and the step (Psi, Sigma, q) of section 4.1.
 
-The network's setting `residual` chooses one of two, and both can express every step:
+The setting `residual` of the network chooses one of two maps. Both can express every step:
 
     False (the paper)    Psi, Sigma and q are the output
     True                 Psi   = Psi_out R_i            R_i  rotation of the deformation of face i's nearest body face
                          Sigma = Sigma_out               (not relative: stretch must not accumulate)
                          q     = q_out + u_c             u_c  mean velocity of the body faces nearest to component c
 
-So a residual output of identity and q = 0, which is what an untrained residual network gives, means "moves like skin",
-with the stretch its statistics call usual (none, before training).
+So a residual output of identity and q = 0, which an untrained residual network gives, means that the garment moves like
+skin. Its stretch is then the mean of the statistics, which is 1 before training.
 
 `compose` and `targets` are inverses of each other, and work on padded [B,N,...] and packed [F,...] arrays alike.
 """
@@ -24,7 +24,7 @@ from warpgarment.kernels.features.channels import FEATURES, LAYOUT
 
 
 class NetworkOutput(NamedTuple):
-    """Output of the network in physical units, as its parametrisation means it; or the training target for it."""
+    """Output of the network, or its training target, in physical units and before `compose`."""
 
     psi: torch.Tensor  # [..., N,3,3]
     singular_values: torch.Tensor  # [..., N,3]
@@ -32,15 +32,15 @@ class NetworkOutput(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What happens from frame t to t+1, whatever the parametrisation."""
+    """The step from frame t to t+1, which does not depend on the parametrisation."""
 
     psi: torch.Tensor  # relative deformation gradient, [..., N,3,3]
-    singular_values: torch.Tensor  # of the next deformation gradient, [..., N,3]
-    velocity: torch.Tensor  # of each component's mean face centroid, [..., C,3], metres per frame
+    singular_values: torch.Tensor  # singular values of the next deformation gradient, [..., N,3]
+    velocity: torch.Tensor  # velocity of the mean face centroid of each component, [..., C,3], metres per frame
 
 
 class StepContext(NamedTuple):
-    """What of the newest frame the parametrisation refers to."""
+    """The quantities of the newest frame that the residual parametrisation refers to."""
 
     body_rotation: torch.Tensor  # R_i, [..., N,3,3]
     body_velocity: torch.Tensor  # u_c, [..., C,3] metres per frame
@@ -52,13 +52,13 @@ def component_mean(
     """Mean over the faces of each component.
 
     Args:
-        values: Shape [...,N,K].
+        values: Values of the faces, shape [...,N,K].
         face_component: Component of each face, integer, shape [...,N].
-        count: Number of components C (at most, in a padded batch).
+        count: Number of components C, in a padded batch the largest one.
         face_mask: True where a face is real, shape [...,N]; None where all are.
 
     Returns:
-        Shape [...,C,K]; zero for a component without faces.
+        Means, shape [...,C,K]; zero for a component without faces.
     """
     index = face_component.long()
     if face_mask is not None:
@@ -77,7 +77,7 @@ def component_mean(
 def context(
     face_features: torch.Tensor, face_component: torch.Tensor, count: int, face_mask: torch.Tensor | None = None
 ) -> StepContext:
-    """Reads the context from the features, whose newest frame holds all of it.
+    """Reads the context from the newest frame of the features.
 
     Args:
         face_features: Features in world space, shape [...,N,34] or stacked [...,N,H*34] with the newest last.
@@ -86,7 +86,7 @@ def context(
         face_mask: True where a face is real, shape [...,N]; None where all are.
 
     Returns:
-        No gradient flows through the rotation.
+        The context; no gradient flows through its rotation.
     """
     newest = face_features[..., -FEATURES:]
     deformation = newest[..., LAYOUT["body_deformation"]].detach()
@@ -99,15 +99,15 @@ def context(
 
 
 def compose(output: NetworkOutput, context: StepContext, *, residual: bool) -> Step:
-    """Network output -> step.
+    """The step that an output of the network stands for.
 
     Args:
-        output: In physical units and world space.
-        context: Of the newest frame, in world space.
+        output: Output in physical units and world space.
+        context: Context of the newest frame, in world space.
         residual: The network's setting.
 
     Returns:
-        The step. Singular values are as predicted: nothing keeps them positive or sorted here.
+        The step. Its singular values are those predicted, which need not be positive or sorted.
     """
     if not residual:
         return Step(*output)
@@ -119,7 +119,7 @@ def compose(output: NetworkOutput, context: StepContext, *, residual: bool) -> S
 
 
 def targets(step: Step, context: StepContext, *, residual: bool) -> NetworkOutput:
-    """Step -> the network output that means it; the inverse of `compose`, with the same arguments."""
+    """The network output that stands for a step: the inverse of `compose`, with the same `context` and `residual`."""
     if not residual:
         return NetworkOutput(*step)
     return NetworkOutput(

@@ -1,7 +1,7 @@
-"""Lays packed faces out in padded rows for a network.
+"""Arranges packed faces in padded rows for a network.
 
 A row of a padded view is one garment, or one of its `face_splits` interleaved subsets of faces (section 4.3). Rows of
-similar length share a view, so little is padded, and a batch of one garment many times shares its geodesic weights.
+similar length share a view, so there is little padding, and a batch that repeats one garment shares geodesic weights.
 """
 
 from __future__ import annotations
@@ -21,43 +21,44 @@ from .config import NetworkConfig
 from .inputs import RowInputs
 from .parametrisation import NetworkOutput
 
-TOKENS_PER_VIEW = 131_072  # faces in one call of the network: bounds its activations to a few GB
-WEIGHTS_PER_VIEW = 2**30  # entries of geodesic weights in one call: 4 GB
-TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps some more, of half the size
-PADDING = 1.25  # rows share a view when the longest has at most this many times the faces of the shortest
+TOKENS_PER_VIEW = 131_072  # most faces in one call of the network; bounds its activations to a few GB
+WEIGHTS_PER_VIEW = 2**30  # most entries of geodesic weights in one call, 4 GB
+TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps 1.5 more, of half the size
+PADDING = 1.25  # rows share a view if the longest has at most this many times the faces of the shortest
 
 
 @dataclasses.dataclass(frozen=True)
 class PaddedView:
-    """Some rows of a batch as the network wants them; R rows of at most N faces and C components."""
+    """Some rows of a batch, padded for the network: R rows of at most N faces and C components."""
 
     face_index: torch.Tensor  # int64 [R,N], into the packed faces; 0 where padded
     face_mask: torch.Tensor | None  # bool [R,N]; None where nothing is padded
     component_index: torch.Tensor  # int64 [R,C], into the packed components; 0 where padded
     component_mask: torch.Tensor | None  # bool [R,C]
-    weights: Any  # from `Architecture.rows`, of R rows, or of one that serves them all
+    weights: Any  # the result of `Architecture.rows` for R rows, or for one row that serves them all
     share: torch.Tensor  # [R], one over the number of rows of the same garment
-    real_faces: torch.Tensor | None  # int64, where face_mask is True in rows end to end; None where all are
-    real_components: torch.Tensor | None  # the same of component_mask
-    in_order: bool  # the view is the packed batch itself, in one row
+    real_faces: torch.Tensor | None  # int64, indices of True entries of the flattened face_mask; None if it is None
+    real_components: torch.Tensor | None  # int64, indices of True entries of the flattened component_mask
+    in_order: bool  # whether the view is the packed batch itself, in one row
 
     def faces(self, packed: torch.Tensor) -> torch.Tensor:
-        """Values of the packed faces in rows; [F,...] -> [R,N,...]."""
+        """Takes values of packed faces to rows, [F,...] -> [R,N,...]."""
         return packed[None] if self.in_order else packed[self.face_index]
 
     def components(self, packed: torch.Tensor) -> torch.Tensor:
-        """Values of the packed components in rows; [C,...] -> [R,C,...]."""
+        """Takes values of packed components to rows, [C,...] -> [R,C,...]."""
         return packed[self.component_index]
 
     def inputs(self, features: torch.Tensor, velocities: torch.Tensor) -> RowInputs:
-        """These rows of packed features [F,H*K] and velocities [C,(H-1)*3]."""
+        """Inputs of these rows, from packed features [F,H*K] and velocities [C,(H-1)*3]."""
         rows = self.faces(features), self.components(velocities)
         return RowInputs(*rows, self.weights, self.face_mask, self.component_mask)
 
     def add_to(self, packed: NetworkOutput, rows: NetworkOutput) -> None:
-        """Writes what the network said of these rows into packed arrays.
+        """Writes the output of these rows into packed arrays.
 
-        All rows of a garment say something of a component's velocity: their mean is taken, so it must start at zero.
+        Every row of a garment predicts the velocities of its components. Their mean is added to `packed.velocity`,
+        which must start at zero.
         """
         for target, values in ((packed.psi, rows.psi), (packed.singular_values, rows.singular_values)):
             index, said = _those(self.real_faces, self.face_index, values)
@@ -67,31 +68,31 @@ class PaddedView:
 
 
 class RowLayout(NamedTuple):
-    """A packed batch as a network wants it that answers face by face."""
+    """The layout of a packed batch for a network that predicts face by face."""
 
     views: list[PaddedView]
-    face_component: torch.Tensor  # int32 [F], of the packed faces
+    face_component: torch.Tensor  # int32 [F], component of each packed face
 
 
 def row_layout(
     packed: PackedGarments, garments: Sequence[Garment], config: NetworkConfig, face_splits: int = 1
 ) -> RowLayout:
-    """Arguments as in `padded_views`."""
+    """The `RowLayout` of a batch; the arguments are those of `padded_views`."""
     return RowLayout(padded_views(packed, garments, config, face_splits), packed.face_component)
 
 
 def padded_views(
     packed: PackedGarments, garments: Sequence[Garment], config: NetworkConfig, face_splits: int = 1
 ) -> list[PaddedView]:
-    """Lays a packed batch out for the network.
+    """Divides a packed batch into padded views for the network.
 
     Args:
         packed: The batch.
         garments: The same garments, for their geodesic distances.
-        config: Of the network.
-        face_splits: Disjoint subsets of faces per garment, each seen by the network alone: faces s, s+n, s+2n, ...
-            Attention costs n times less, and a face no longer hears all others. Kinds of networks without `subsets`
-            see whole garments always.
+        config: Settings of the network.
+        face_splits: Number n of disjoint subsets of each garment's faces (s, s+n, s+2n, ...), each of which the network
+            sees alone. Attention costs n times less, but a face no longer attends to all others. Kinds of networks
+            without `subsets` always see whole garments.
     """
     if not architecture(config.architecture).subsets:
         face_splits = 1
@@ -102,12 +103,15 @@ def padded_views(
 def row_groups(
     garments: Sequence[Garment], config: NetworkConfig, face_splits: int
 ) -> list[list[tuple[int, int, int]]]:
-    """Which rows share a view, the longest first; each row is a garment's number, its first face, and how many faces.
+    """Groups rows that share a view, the longest first. A row is (number of its garment, first face, number of faces).
 
     Args:
-        garments: In the order of the batch.
-        config: Of the network.
-        face_splits: As `padded_views`.
+        garments: The garments, in the order of the batch.
+        config: Settings of the network.
+        face_splits: Number of subsets, as in `padded_views`.
+
+    Raises:
+        ValueError: `face_splits` is less than 1.
     """
     if face_splits < 1:
         raise ValueError(f"face_splits must be at least 1, got {face_splits}")
@@ -136,15 +140,15 @@ def row_groups(
 
 
 def activation_bytes(tokens: int, stack: int, stacks: tuple[float, float], width: int, hidden: int, half: bool) -> int:
-    """Bytes that a call of a transformer needs in passing, by factors that were measured with torch's profiler.
+    """Temporary memory [bytes] of a call of a transformer, by factors measured with torch's profiler.
 
     Args:
         tokens: Number of faces in the call, padded ones included.
         stack: Bytes of the stacked features of a face.
-        stacks: Copies of these, while they are prepared and while the network runs.
-        width: Of a token.
-        hidden: Of its feed-forward layer.
-        half: Whether it runs in bfloat16.
+        stacks: Number of copies of the stacked features while they are prepared, and while the network runs.
+        width: Width of a token.
+        hidden: Width of the feed-forward layer.
+        half: Whether the network runs in bfloat16.
     """
     inside = stacks[1] * stack + (2 * (TOKENS + 1.5) if half else 4 * TOKENS) * width
     inside += 4 * max(0, 2 * hidden - 3 * width)
@@ -193,12 +197,12 @@ def _mask(index: np.ndarray, device: torch.device) -> torch.Tensor | None:
 
 
 def _real(index: np.ndarray, device: torch.device) -> torch.Tensor | None:
-    """Where a mask is True, found once: a GPU that is indexed by a mask makes the host wait for the number of rows."""
+    """Indices of the real entries, found once: indexing by a mask on a GPU makes the host wait for the count."""
     real = np.flatnonzero(index >= 0)
     return None if len(real) == index.size else torch.from_numpy(real).to(device)
 
 
 def _those(real: torch.Tensor | None, *rows: torch.Tensor) -> list[torch.Tensor]:
-    """Tensors [R,N,...] with their rows end to end, and only the real ones of these; [M,...] each."""
+    """Tensors [R,N,...] with rows flattened and without padding, [M,...] each; `real` are the indices to keep."""
     flat = [tensor.flatten(0, 1) for tensor in rows]
     return flat if real is None else [tensor[real] for tensor in flat]

@@ -1,14 +1,14 @@
 """Runs a network on rows of garments: the one place where inputs are turned, mirrored, normalised and cast for it.
 
     features, velocities, target       world space, physical units
-      turn                             to the heading the network knows (heading.py), and then by `turn`; the rest pose
-                                       by `rest_turn`
-      mirror                           rows that are chosen, in x
-      normalise, noise, cast           statistics of the network; Gaussian noise on its inputs; bfloat16
+      turn                             to the network's heading (heading.py), then by `turn`; the rest pose is turned by
+                                       `rest_turn`
+      mirror                           in x, for the rows of `mirrored`
+      normalise, noise, cast           by the network's statistics; Gaussian noise on its inputs; bfloat16
     forward_normalised
       denormalise, mirror, turn back   in float32
 
-Simulation, training and `GarmentNetwork.forward` all come here.
+Simulation, training and `GarmentNetwork.forward` all use it.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ PSI = Layout([Channel("psi", 9, Kind.MAP)])
 
 
 class Ran(NamedTuple):
-    """What came of a call of the network."""
+    """Result of a call of the network."""
 
-    output: NetworkOutput  # physical units; world space, or the network's frame where the inputs were in it
+    output: NetworkOutput  # physical units; in world space, or in the network's frame if the inputs were
     normalised: NormalisedOutput  # in the network's frame
-    target: NormalisedOutput | None  # likewise
+    target: NormalisedOutput | None  # in the network's frame; None if none was given
 
 
 def run(
@@ -48,14 +48,14 @@ def run(
     bfloat16: bool = False,
     target: NetworkOutput | None = None,
 ) -> Ran:
-    """Calls a network.
+    """Runs a network on rows of garments.
 
     Args:
-        network: In whichever mode: dropout is on in training mode.
-        inputs: In world space, or where they say so in the network's frame.
-        noise: Standard deviation of Gaussian noise on the normalised inputs; 0: none.
-        bfloat16: Run `forward_normalised` under autocast to bfloat16; else under whatever autocast the caller is in.
-        target: What the output should be, in the same space as the inputs.
+        network: The network; in training mode, dropout is on.
+        inputs: Inputs in world space, or in the network's frame if `in_network_frame` is set.
+        noise: Standard deviation of Gaussian noise on the normalised inputs; 0 for none.
+        bfloat16: Whether `forward_normalised` runs under autocast to bfloat16. Otherwise the caller's autocast applies.
+        target: The desired output, in the same space as the inputs; None if there is none.
     """
     kind = inputs.features.device.type
     half = bfloat16 or torch.is_autocast_enabled(kind)
@@ -90,7 +90,7 @@ def run(
 
 
 def _turn(network: GarmentNetwork, inputs: RowInputs) -> torch.Tensor | None:
-    """From the inputs' world to the network's frame, [R,3,3]; None where there is nothing to turn."""
+    """Rotations from the inputs' world to the network's frame, [R,3,3]; None if there is nothing to turn."""
     if inputs.in_network_frame or network.config.heading == "world":
         return None if inputs.in_network_frame else inputs.turn
     own = canonical_frame(inputs.features, inputs.face_mask)
@@ -98,12 +98,12 @@ def _turn(network: GarmentNetwork, inputs: RowInputs) -> torch.Tensor | None:
 
 
 def rotate_output(output: NetworkOutput, turn: torch.Tensor | None, *, inverse: bool = False) -> NetworkOutput:
-    """Output (or target) turned as the inputs were, or back; unchanged where `turn` is None.
+    """An output, or a target, rotated like the inputs, or back; unchanged if `turn` is None.
 
     Args:
-        output: In physical units, shapes as in `NetworkOutput` with rows in front.
+        output: Output in physical units, shapes as in `NetworkOutput` with rows in front.
         turn: Rotation of each row, shape [R,3,3].
-        inverse: Back to the world.
+        inverse: Whether to rotate back to the world.
     """
     if turn is None:
         return output
@@ -116,12 +116,12 @@ def rotate_output(output: NetworkOutput, turn: torch.Tensor | None, *, inverse: 
 def mirror_inputs(
     features: torch.Tensor, velocities: torch.Tensor, chosen: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features [R,N,H*K] and velocities [R,C,(H-1)*3] as a mirror in x shows them, in the rows chosen, bool [R]."""
+    """Features [R,N,H*K] and velocities [R,C,(H-1)*3], mirrored in x in the chosen rows, bool [R]."""
     return features * _signs(FACE, features, chosen), velocities * _signs(VELOCITY, velocities, chosen)
 
 
 def mirror_output(output: NetworkOutput, chosen: torch.Tensor) -> NetworkOutput:
-    """Output (or target) as a mirror in x shows it, in the rows chosen, bool [R]; undone by the same."""
+    """An output, or a target, mirrored in x in the chosen rows, bool [R]; a second call undoes it."""
     psi = output.psi.flatten(-2)
     return output._replace(
         psi=(psi * _signs(PSI, psi, chosen)).unflatten(-1, (3, 3)),
@@ -130,14 +130,14 @@ def mirror_output(output: NetworkOutput, chosen: torch.Tensor) -> NetworkOutput:
 
 
 def _signs(layout: Layout, values: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
-    """Signs [R,1,W] for values [R,*,W] that hold the layout one or several times."""
+    """Signs [R,1,W] by which mirroring multiplies values [R,*,W], which hold the layout one or several times."""
     signs = layout.mirror(values.device).repeat(values.shape[-1] // layout.width)
     return torch.where(chosen[:, None], signs, torch.ones_like(signs))[:, None]
 
 
 @contextmanager
 def evaluating(network: GarmentNetwork) -> Iterator[None]:
-    """A network in evaluation mode, and afterwards in the mode it was in."""
+    """Puts a network in evaluation mode for a block, and restores its mode afterwards."""
     training = network.training
     network.eval()
     try:

@@ -4,8 +4,8 @@
     base/model-00002-of-00002.safetensors      the others, and the same metadata
     base/model.safetensors.index.json          {"metadata": {"total_size": bytes}, "weight_map": {tensor: file}}
 
-Each shard's metadata also hold `shard` ("1 of 2") and `digest`, the SHA-256 of all tensors of all shards, so that
-shards of different checkpoints are told apart even where everything else about them agrees.
+The metadata of each shard also hold `shard` ("1 of 2") and `digest`, the SHA-256 of all tensors of all shards, by which
+shards of different checkpoints differ even if everything else about them agrees.
 """
 
 from __future__ import annotations
@@ -17,16 +17,18 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 
-from warpgarment.errors import CheckpointError
+from warpgarment.errors import CheckpointError, MeshError
 from warpgarment.io.disk.atomic import atomic_folder
+from warpgarment.io.disk.plain import JSON_LARGEST, check_plain, read_plain
 
-SINGLE = "model.safetensors"  # where one file is enough; there is no index then
+from .bounds import checked_json
+
+SINGLE = "model.safetensors"  # name of the file if one is enough; there is no index then
 INDEX = "model.safetensors.index.json"
 _SHARD = re.compile(r"model-\d{5}-of-\d{5}\.safetensors")
 _FILE = re.compile(r"\w[\w.-]*\.safetensors", re.ASCII)  # a name in the folder itself, no path
@@ -35,13 +37,13 @@ _AGAIN = "get the checkpoint again"
 
 @dataclass(frozen=True)
 class Contents:
-    """What the headers of a checkpoint's files say.
+    """Contents of the headers of a checkpoint's files.
 
     Attributes:
         path: The file or folder.
-        metadata: Without what belongs to one shard.
-        shapes: Of every tensor.
-        files: The file that holds it.
+        metadata: Metadata that all shards share.
+        shapes: Shape of each tensor, by name.
+        files: File that holds each tensor, by name.
         total_size: Bytes of all tensors according to the index; None for a single file.
     """
 
@@ -55,7 +57,7 @@ class Contents:
         """Reads all tensors, on the CPU, as they are stored.
 
         Raises:
-            CheckpointError: A file is damaged, or shards hold other tensors than those that were saved together.
+            CheckpointError: A file is damaged, or the shards hold tensors that were not saved together.
         """
         tensors: dict[str, torch.Tensor] = {}
         for path in sorted(set(self.files.values())):
@@ -68,7 +70,7 @@ class Contents:
             size = sum(tensor.nbytes for tensor in tensors.values())
             if size != self.total_size:
                 raise CheckpointError(
-                    f"{self.path}: {INDEX} speaks of {self.total_size:,} bytes, its shards hold {size:,}; {_AGAIN}"
+                    f"{self.path}: {INDEX} gives {self.total_size:,} bytes, its shards hold {size:,}; {_AGAIN}"
                 )
             if _digest(tensors) != self.metadata.get("digest"):
                 raise CheckpointError(
@@ -83,10 +85,10 @@ def write(
     """Writes tensors to a folder, which appears whole or not at all and replaces an older checkpoint of its name.
 
     Args:
-        folder: May exist if it holds nothing but a checkpoint.
-        tensors: On the CPU, contiguous.
-        metadata: Of the checkpoint; every shard gets them.
-        max_shard_bytes: No file is larger, its header included. Where one file is enough it is model.safetensors.
+        folder: Folder to write; it may exist if it holds nothing but a checkpoint.
+        tensors: Contiguous tensors on the CPU, by name.
+        metadata: Metadata of the checkpoint, which every shard repeats.
+        max_shard_bytes: Largest size of a file with its header [bytes]. If one file is enough, it is model.safetensors.
 
     Returns:
         The files, the index last.
@@ -114,17 +116,17 @@ def write(
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
-    """The checkpoint that lies at a path.
+    """Finds the checkpoint at a path.
 
     Args:
-        path: A file, a folder with an index, or a folder that holds one file; of several, best.safetensors, which
-            training writes.
+        path: A file, a folder with an index, or a folder that holds one file. Of several files, best.safetensors is
+            taken, which training writes.
 
     Returns:
         The file, or the folder with an index.
 
     Raises:
-        CheckpointError: There is none, or several; says what there is.
+        CheckpointError: There is none, or several; the message says what there is.
     """
     path = Path(path)
     if path.is_file():
@@ -149,8 +151,8 @@ def contents(path: str | os.PathLike[str]) -> Contents:
     """Reads the headers of a checkpoint's files and checks that they belong together.
 
     Raises:
-        CheckpointError: There is no checkpoint, a file is missing, cut short, foreign or of another checkpoint, or the
-            index is damaged, does not fit the shards, or names files outside the folder.
+        CheckpointError: There is no checkpoint; a file is missing, cut short, of another format or of another
+            checkpoint; or the index is damaged, does not fit the shards, or names files outside the folder.
     """
     path = locate(path)
     if path.is_dir():
@@ -184,7 +186,7 @@ def _sharded(folder: Path) -> Contents:
             if tensor in holder:
                 raise CheckpointError(f"{folder}: {tensor} is in two shards, {holder[tensor]} and {name}; {_AGAIN}")
             if weight_map.get(tensor) != name:
-                told = f"says it is in {weight_map[tensor]}" if tensor in weight_map else "does not know it"
+                told = f"says it is in {weight_map[tensor]}" if tensor in weight_map else "does not list it"
                 raise CheckpointError(f"{folder}: {name} holds {tensor}, {INDEX} {told}; {_AGAIN}")
             holder[tensor], shapes[tensor] = name, shape
     absent = sorted(weight_map.keys() - holder.keys())
@@ -196,14 +198,14 @@ def _sharded(folder: Path) -> Contents:
 
 
 def _read_index(folder: Path) -> tuple[dict[str, str], int]:
-    """Tensor -> file name, and the bytes of all tensors."""
+    """Name of the file that holds each tensor, and the size of all tensors [bytes]."""
     path = folder / INDEX
     try:
-        index: Any = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        text = read_plain(path, JSON_LARGEST).decode("utf-8")
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: is not JSON ({error}); {_AGAIN}") from error
-    weight_map = index.get("weight_map") if isinstance(index, dict) else None
-    about = index.get("metadata") if isinstance(index, dict) else None
+    index = checked_json(path, "the index", text)
+    weight_map, about = index.get("weight_map"), index.get("metadata")
     total = about.get("total_size") if isinstance(about, dict) else None
     if not isinstance(weight_map, dict) or not weight_map or type(total) is not int:
         raise CheckpointError(f"{path}: weight_map or metadata.total_size is missing; {_AGAIN}")
@@ -218,20 +220,21 @@ def _read_index(folder: Path) -> tuple[dict[str, str], int]:
 def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
     """Metadata and shapes of one file."""
     try:
+        check_plain(path)
         with safe_open(path, framework="pt", device="cpu") as file:
             return dict(file.metadata() or {}), {k: tuple(file.get_slice(k).get_shape()) for k in file.keys()}
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, MeshError) as error:
         raise CheckpointError(
             f"{path}: not a safetensors file, or one cut short ({error}); get it again or check the path"
         ) from error
 
 
 def _split(tensors: Mapping[str, torch.Tensor], limit: int, overhead: int) -> list[list[str]]:
-    """Tensors in their order, into as few files as that order allows: a file is full when the next does not fit."""
+    """Divides tensors, in their order, among files: a new file begins when the next tensor does not fit."""
     shards: list[list[str]] = [[]]
     filled = overhead
     for name, tensor in tensors.items():
-        size = tensor.nbytes + len(name) + 128 + 8 * tensor.dim()  # with its entry in the header, generously
+        size = tensor.nbytes + len(name) + 128 + 8 * tensor.dim()  # with an upper bound of its entry in the header
         if overhead + size > limit:
             raise ValueError(f"max_shard_bytes is {limit:,}, too little for {name} alone, {overhead + size:,} bytes")
         if filled + size > limit:
@@ -243,7 +246,7 @@ def _split(tensors: Mapping[str, torch.Tensor], limit: int, overhead: int) -> li
 
 
 def _digest(tensors: Mapping[str, torch.Tensor]) -> str:
-    """SHA-256 of names, types, shapes and bytes, whatever their order."""
+    """SHA-256 of names, types, shapes and bytes; it does not depend on the order of the tensors."""
     total = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from warpgarment.geometry.checks import (
     checked_fps,
     checked_positions,
     complain,
+    far_from_origin,
     no_area,
     repeated_vertices,
     to_numpy,
@@ -21,7 +23,10 @@ from warpgarment.geometry.checks import (
 from warpgarment.geometry.orientation import turned_outward
 from warpgarment.io.surface.record import Surface
 
-MOST_BETWEEN, LARGEST = 100, 1 << 30  # new frames for each old one, and bytes, that resampling makes at most
+from .clock import Clock, between
+
+if TYPE_CHECKING:
+    from warpgarment.io.source import Source
 
 
 class BodyMotion:
@@ -35,6 +40,10 @@ class BodyMotion:
         vertices: Positions [m], Y up, float32, shape [T,V,3].
         faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
         fps: Frames per second.
+        start: Time of the first frame [s].
+        last: When the last frame is reached, in frames after the first: T - 1, or less where resampling put the end of
+            the motion on a frame that comes a little later. See `Clock`.
+        source: How its file was read (`warpgarment.io.source.Source`); None for a motion made of arrays.
         surface: Polygons, texture coordinates, materials and groups of the file it was loaded from, for `save`; None:
             triangles alone. They are lost where faces are left out.
 
@@ -42,31 +51,49 @@ class BodyMotion:
         vertices: Positions [m], shape [T,V,3]; NumPy, torch or nested lists.
         faces: Vertex indices, integers, shape [F,3], in either winding.
         fps: Frames per second, positive.
+        start: Time of the first frame [s]: 1001 / 24 for a shot of 24 frames a second that starts at frame 1001.
+        last: As above; None: T - 1.
 
     Raises:
         MeshError: The arrays have other shapes, no frames or no faces, numbers that are not finite (named by frame),
-            indices out of range, no face with an area, or a rate that is not positive.
+            indices out of range, no face with an area, a rate that is not positive, or a time that is none.
+
+    Warns:
+        UserWarning: Faces were turned round; or the body is so far from the origin that float32 cannot tell its shape.
     """
 
     surface: Surface | None = None
+    source: Source | None = None
 
-    def __init__(self, vertices: Any, faces: Any, fps: float = 30.0):
+    def __init__(self, vertices: Any, faces: Any, fps: float = 30.0, *, start: float = 0.0, last: float | None = None):
         self.vertices = checked_positions(vertices, frames=True)
         self.faces = checked_faces(faces, self.vertices.shape[1])
-        self.fps = checked_fps(fps)
+        _, self.fps, self.start, self.last = Clock.checked(len(self.vertices), fps, start, last)
         flat = repeated_vertices(self.faces) | no_area(self.vertices[0], self.faces)
         self.degenerate_faces = int(np.count_nonzero(flat))
         if flat.all():
             complain(flat, "faces", "have no area in the first frame", "A body needs a surface.")
+        reach = np.maximum(self.vertices.max(axis=(1, 2)), -self.vertices.min(axis=(1, 2)))
+        worst = int(reach.argmax())
+        what = f"the body in frame {worst}" if worst else "the body"
+        far = far_from_origin(to_numpy(vertices)[worst], self.faces, what)
+        if far:
+            warnings.warn(far, UserWarning, stacklevel=2)
         self.faces = turned_outward(self.vertices[0], self.faces, "the body")
 
     @classmethod
     def _derived(
-        cls, vertices: np.ndarray, faces: np.ndarray, fps: float, degenerate_faces: int, surface: Surface | None = None
+        cls,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        clock: Clock,
+        degenerate_faces: int,
+        surface: Surface | None = None,
     ) -> BodyMotion:
         """A motion of vertices and faces that another one has checked and turned outwards."""
         motion = cls.__new__(cls)
-        motion.vertices, motion.faces, motion.fps, motion.degenerate_faces = vertices, faces, fps, degenerate_faces
+        motion.vertices, motion.faces, motion.degenerate_faces = vertices, faces, degenerate_faces
+        _, motion.fps, motion.start, motion.last = clock
         motion.surface = surface
         return motion
 
@@ -82,6 +109,11 @@ class BodyMotion:
         """Number of frames."""
         return len(self.vertices)
 
+    @property
+    def clock(self) -> Clock:
+        """When the frames are."""
+        return Clock.checked(self.frames, self.fps, self.start, self.last)
+
     @classmethod
     def load(
         cls,
@@ -93,7 +125,7 @@ class BodyMotion:
         mesh: str | None = None,
         up: str | None = None,
     ) -> BodyMotion:
-        """Reads a motion.
+        """Reads a motion, with the time of its first frame where the file has it.
 
         - ``.npz`` with `vertices` [T,V,3], `faces` [F,3] and `fps`;
         - ``.npz`` with `rest_vertices`, `faces`, `bone_indices`, `bone_weights`, `bone_transforms`, `fps` and, if
@@ -120,24 +152,30 @@ class BodyMotion:
                 refuses them.
             FileNotFoundError: There is no such file.
         """
-        from warpgarment.io.files import rate_of, read_motion
+        from warpgarment.io.files import rate_of, read_motion, start_of
+        from warpgarment.io.source import source_of
 
         path = Path(path)
         data = read_motion(path, unit=unit, mesh=mesh, up=up)
         rate = rate_of(path, data, fps)
         try:
-            motion = cls(data.vertices, data.faces, rate)
+            motion = cls(data.vertices, data.faces, rate, start=start_of(data, rate), last=data.last)
             if data.surface is not None:
                 data.surface.check_vertices(motion.vertices.shape[1])
                 motion.surface = data.surface.following(data.faces, motion.faces)
-            return motion.submesh(data.collider_faces) if collider and data.collider_faces is not None else motion
+            if collider and data.collider_faces is not None:
+                motion = motion.submesh(data.collider_faces)
+            motion.source = source_of(
+                path, unit=unit, mesh=mesh, up=up, fps=fps, file_fps=data.fps, frames=motion.frames
+            )
+            return motion
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes the motion as .npz, .usd (.usda, .usdc), .glb, .pc2 with .obj beside it, or a folder of .obj files.
 
-        The output is written completely or not at all.
+        The output is written completely or not at all, with the time of the first frame as `GarmentMotion.save` has it.
 
         Args:
             path: File or folder to write; its suffix decides the format. With a slash at the end it is a folder.
@@ -146,35 +184,32 @@ class BodyMotion:
         from warpgarment.io.files import write_motion
 
         name = Path(path).stem or "body"
-        write_motion(path, MotionData(self.vertices, self.faces, self.fps, name=name, surface=self.surface))
+        write_motion(path, MotionData.of(self.vertices, self.faces, self.clock, name=name, surface=self.surface))
 
     def resampled(self, fps: float, frames: int | None = None) -> BodyMotion:
         """The motion at another rate, with positions interpolated linearly in time.
 
-        It starts at the first frame and has as many whole frames as fit: floor((T - 1) fps' / fps) + 1.
+        It starts with the first frame and lasts to the last one, which the last new frame holds wherever that comes: it
+        has ceil((T - 1) fps' / fps) + 1 frames. Resampled to the first rate again it has the first frames again, the
+        last one unchanged.
 
         Args:
             fps: New frames per second.
-            frames: No more than so many of the new frames; None: all.
+            frames: Largest number of new frames; None for all.
 
         Raises:
             MeshError: The rate is not positive, or so much higher than the motion's that the frames would fill memory.
         """
-        fps = checked_fps(fps)
-        if fps == self.fps:
+        if checked_fps(fps) == self.fps:
             return self
-        last = self.frames - 1
-        count = int(min(np.floor(last * fps / self.fps + 1e-6) + 1, frames or np.inf, 2**62))
-        if count > MOST_BETWEEN * self.frames and 12 * count * self.vertices.shape[1] > LARGEST:
-            raise MeshError(
-                f"{self.frames:,} frames at {self.fps:g} a second would be {count:,} at {fps:g}: more than "
-                f"{LARGEST:,} bytes. Is the rate right? Give it with fps=."
-            )
-        time = np.minimum(np.arange(count) * (self.fps / fps), last)
-        before = np.minimum(time.astype(np.int64), max(last - 1, 0))
-        share = (time - before).astype(np.float32)[:, None, None]
-        vertices = self.vertices[before] * (1 - share) + self.vertices[np.minimum(before + 1, last)] * share
-        return self._derived(vertices, self.faces, fps, self.degenerate_faces, self.surface)
+        clock, places = self.clock.resampled(fps, frames, points=self.vertices.shape[1])
+        return self._derived(between(self.vertices, places), self.faces, clock, self.degenerate_faces, self.surface)
+
+    def on_clock(self, clock: Clock) -> BodyMotion:
+        """The motion at the frames of another clock, in a straight line between its own; before and after it stands
+        still."""
+        vertices = between(self.vertices, self.clock.places(clock.times))
+        return self._derived(vertices, self.faces, clock, self.degenerate_faces, self.surface)
 
     def submesh(self, face_mask: Any) -> BodyMotion:
         """The motion of some faces only, without the vertices that belong to none of them.
@@ -194,4 +229,4 @@ class BodyMotion:
         faces = faces.reshape(-1, 3).astype(np.int32)
         vertices = self.vertices[:, used]
         flat = repeated_vertices(faces) | no_area(vertices[0], faces)
-        return self._derived(vertices, faces, self.fps, int(np.count_nonzero(flat)))
+        return self._derived(vertices, faces, self.clock, int(np.count_nonzero(flat)))

@@ -57,6 +57,9 @@ def fit(garment: Garment, body_rest: Any, body_first: Any, *, epsilon: float | N
     Raises:
         MeshError: The two bodies differ in vertices or faces, or one is not a mesh.
     """
+    simulated = garment.simulated
+    if simulated.garment is not garment:
+        return simulated.restored(fit(simulated.garment, body_rest, body_first, epsilon=epsilon))
     epsilon = least_clearance(garment) if epsilon is None else epsilon
     rest, faces = _body(body_rest, None, "body_rest")
     first, _ = _body(body_first, faces, "body_first")

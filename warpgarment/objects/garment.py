@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,15 +18,24 @@ from warpgarment.geometry.checks import (
     checked_faces,
     checked_pins,
     checked_positions,
+    complain,
     directed_edges,
+    far_from_origin,
+    no_area,
+    to_numpy,
 )
 from warpgarment.geometry.clean import clean_mesh
 from warpgarment.geometry.orientation import agreeing
+from warpgarment.geometry.seams import REMEDY as SEWING
+from warpgarment.geometry.seams import coinciding_borders
 from warpgarment.io.disk.cache import remembered
 from warpgarment.io.surface.record import Surface
 
+from .simulated import Simulated
+
 if TYPE_CHECKING:
     from warpgarment.geometry.pooled_geodesics import PooledGeodesics
+    from warpgarment.io.source import Source
 
 
 POOLED = 10_000  # with more faces the network's weights are pooled: F x F of them would take 400 MB
@@ -42,6 +52,10 @@ class Garment:
         name: Name of the garment, for messages and file names.
         surface: Polygons, texture coordinates, materials and groups, as the garment's file has them; a rollout hands
             them on to its result. None: nothing but the triangles.
+        source: How its file was read (`warpgarment.io.source.Source`); None for a garment made of arrays.
+
+    Borders of panels that lie at the same place stay open unless they are joined (`clean=True`, `cleaned`), and small
+    loose pieces such as buttons ride on the cloth: see `simulated`.
 
     The cached properties (`edges`, `components`, `face_frames`, `geodesics`, `pooled_geodesics`, `laplacian`) are
     computed from these arrays once: do not change the arrays, make a new garment instead.
@@ -61,11 +75,17 @@ class Garment:
     """
 
     surface: Surface | None = None
+    source: Source | None = None
+    _joined: tuple[Garment, np.ndarray] | None = None  # a mesh with its seams joined, and where each vertex went [V]
 
     def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", surface: Surface | None = None):
         self.vertices = checked_positions(vertices)
         given = checked_faces(faces, len(self.vertices), remedy=REMEDY)
         self.faces = agreeing(self.vertices, given, f"garment {name!r}" if name else "the garment")
+        far = far_from_origin(vertices, self.faces, f"garment {name!r}" if name else "the garment")
+        if far:
+            complain(no_area(self.vertices, self.faces), "faces", "have no area", far)
+            _warn(far)
         check_rest_mesh(self.vertices, self.faces)
         self.pins = checked_pins(pins, len(self.vertices))
         self.name = str(name)
@@ -93,11 +113,15 @@ class Garment:
         .npz and .usd files come in the file's number and order. Formats that repeat vertices for every face (.stl) or
         seam (.glb, .gltf) have vertices at exactly the same place joined again.
 
+        Pattern panels, whose seams have vertices of their own on both sides, are recognised by open borders at the same
+        place: with `clean` their seams are joined, without it they open, after a warning.
+
         Args:
             path: File to read.
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that
                 USD files are converted by their own `metersPerUnit` and `upAxis`.
-            clean: Whether a mesh that the constructor would refuse is repaired as by `cleaned_from`.
+            clean: Whether seams are joined, and a mesh that the constructor would refuse is repaired, as by
+                `cleaned_from` with `keep`: the vertices stay those of the file, in their order.
             mesh: Name of the mesh to read where a file holds several: a prim of USD, an object or group of OBJ, a node
                 or mesh of glTF. "*" reads everything in OBJ and glTF as one.
             up: Axis that points up in the file, "y" or "z". None is Y, except that USD files say it themselves.
@@ -107,16 +131,24 @@ class Garment:
             FileNotFoundError: There is no such file.
 
         Warns:
-            UserWarning: The garment is larger than 10 m or smaller than 5 cm, so that the unit is probably wrong.
+            UserWarning: The garment is larger than 10 m or smaller than 5 cm, so that the unit is probably wrong; what
+                `clean` has changed; and as `simulated`.
         """
         from warpgarment.io.files import read_mesh
+        from warpgarment.io.source import source_of
 
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh, up=up)
         try:
-            make = cls.cleaned_from if clean else cls
-            name = data.name or path.stem
-            return make(data.vertices, data.faces, pins=data.pins, name=name, surface=data.surface)
+            told: dict[str, Any] = {"pins": data.pins, "name": data.name or path.stem, "surface": data.surface}
+            garment = (
+                cls.cleaned_from(data.vertices, data.faces, **told, keep=True)
+                if clean
+                else cls(data.vertices, data.faces, **told)
+            )
+            garment.simulated  # noqa: B018  # what is said of it is said where it is read
+            garment.source = source_of(path, unit=unit, mesh=mesh, up=up)
+            return garment
         except MeshError as error:
             raise MeshError(f"{path}: {error}") from None
 
@@ -136,35 +168,93 @@ class Garment:
 
     @classmethod
     def cleaned_from(
-        cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", surface: Surface | None = None
+        cls,
+        vertices: Any,
+        faces: Any,
+        *,
+        pins: Any = None,
+        name: str = "",
+        keep: bool = False,
+        surface: Surface | None = None,
     ) -> Garment:
-        """A garment from a mesh that the constructor refuses.
+        """A garment from a mesh that the constructor refuses, or whose seams are open.
 
-        Vertices closer than 1e-6 of the bounding box are merged; vertices that are not finite are removed with their
-        faces; faces with indices out of range, with a vertex twice or without area, and repeated faces are removed;
-        where more than two faces share an edge, the largest two stay; neighbours that disagree on the outside are
-        flipped to agree with the majority; vertices without a face are removed. Pins and surface follow their vertices.
+        Vertices of open borders that are at the same place (within 5 % of the mean edge length) are joined, wherever
+        an edge has no more than two faces after it; vertices inside a surface never are. Vertices that are not finite
+        are removed with their faces; faces with indices out of range, with a vertex twice or without area, and repeated
+        faces are removed; where more than two faces share an edge, the largest two stay; neighbours that disagree on
+        the outside are flipped to agree with the majority; vertices without a face are removed. Pins and surface
+        follow their vertices.
 
         Args:
             vertices: Rest positions [m], shape [V,3].
             faces: Vertex indices, shape [F,3].
             pins: Vertices to tie to the body's surface, as indices before cleaning, shape [P]; None for none.
             name: Name of the garment, any text.
+            keep: Whether the garment has all finite vertices that were given, in their order, and what is simulated has
+                the joined ones only. Vertices without a face are carried by the cloth nearest to them.
             surface: Polygons that name vertices before cleaning; None for none.
 
         Raises:
             MeshError: Nothing is left, or the arrays have another shape.
-        """
-        new_vertices, new_faces, went = clean_mesh(vertices, faces)
-        new_pins = went[checked_pins(pins, len(went))]
-        if surface is not None:
-            surface.check_vertices(len(went))
-            surface = surface.renumbered(went)
-        return cls(new_vertices, new_faces, pins=new_pins[new_pins >= 0], name=name, surface=surface)
 
-    def cleaned(self) -> Garment:
-        """A cleaned copy: joins vertices at the same place, such as the two sides of a seam. See `cleaned_from`."""
-        return self.cleaned_from(self.vertices, self.faces, pins=self.pins, name=self.name, surface=self.surface)
+        Warns:
+            UserWarning: Something was joined, removed or turned round: how much.
+        """
+        cleaned = clean_mesh(vertices, faces)
+        what = f"garment {name!r}" if name else "the garment"
+        given = checked_pins(pins, len(cleaned.went))
+        new_pins = cleaned.went[given]
+        if surface is not None:
+            surface.check_vertices(len(cleaned.went))
+        shown = None if surface is None else surface.renumbered(cleaned.went)
+        garment = cls(cleaned.vertices, cleaned.faces, pins=new_pins[new_pins >= 0], name=name, surface=shown)
+        _warn(cleaned.message(what))
+        if keep and len(cleaned.went) > len(cleaned.vertices):
+            all_vertices = np.asarray(to_numpy(vertices), dtype=np.float32)
+            garment = garment._with_all(all_vertices, cleaned.corners, cleaned.went, given, surface)
+        return garment
+
+    def _with_all(
+        self, vertices: np.ndarray, faces: np.ndarray, went: np.ndarray, pins: np.ndarray, surface: Surface | None
+    ) -> Garment:
+        """A garment of vertices [U,3] before cleaning, of which this one is simulated; `went` [U] as in `Cleaned`."""
+        finite = np.isfinite(vertices).all(axis=1)
+        number = np.cumsum(finite) - 1
+        if not finite.all():
+            _warn(f"{np.count_nonzero(~finite):,} of {len(finite):,} vertices are not finite and left out.")
+        whole = type(self).__new__(type(self))
+        whole.vertices, whole.faces = np.ascontiguousarray(vertices[finite]), number[faces].astype(np.int32)
+        whole.pins, whole.name = number[pins[went[pins] >= 0]].astype(np.int32), self.name
+        whole.surface = None if surface is None else surface.renumbered(np.where(finite, number, -1))
+        whole._joined = self, went[finite]
+        return whole
+
+    def cleaned(self, *, keep: bool = False) -> Garment:
+        """A cleaned copy: joins open borders at the same place, such as the two sides of a seam; see `cleaned_from`."""
+        return self.cleaned_from(
+            self.vertices, self.faces, pins=self.pins, name=self.name, keep=keep, surface=self.surface
+        )
+
+    @cached_property
+    def simulated(self) -> Simulated:
+        """What is simulated: this garment with its seams joined and without small loose pieces, and the way back.
+
+        Warns:
+            UserWarning: There are small loose pieces, which the cloth carries; or open borders at the same place, which
+                may be seams that were not joined.
+        """
+        what = f"garment {self.name!r}" if self.name else "the garment"
+        if self._joined is not None:
+            result = Simulated(self.vertices, *self._joined)
+        else:
+            seams = coinciding_borders(self.vertices, self.faces)
+            if seams.sides:
+                _warn(f"{what}: {seams.found()}. If they are the sides of seams, {SEWING} As they are, they open.")
+            _warn(seams.unjoined())
+            result = Simulated(self.vertices, self, np.arange(len(self.vertices)))
+        _warn(result.message(what))
+        return result
 
     @cached_property
     def edges(self) -> np.ndarray:
@@ -175,10 +265,15 @@ class Garment:
     def components(self) -> tuple[np.ndarray, np.ndarray, int]:
         """Connected pieces, numbered by their lowest vertex.
 
-        Piece of each vertex, int32 [V]; piece of each face, int32 [F]; number of pieces.
+        Piece of each vertex, int32 [V]; piece of each face, int32 [F]; number of pieces. Panels whose seams are joined
+        are one piece; a vertex without a face has -1.
         """
         from warpgarment.kernels.mesh.laplacian import components
 
+        if self._joined is not None:
+            garment, went = self._joined
+            of_vertex, of_face, count = garment.components
+            return np.where(went >= 0, of_vertex[went], -1).astype(np.int32), of_face, count
         return components(len(self.vertices), self.faces)
 
     @cached_property
@@ -238,3 +333,8 @@ class Garment:
         from warpgarment.kernels.mesh.laplacian import cotangent_laplacian
 
         return cotangent_laplacian(self.vertices, self.faces)
+
+
+def _warn(message: str) -> None:
+    if message:
+        warnings.warn(message, UserWarning, stacklevel=3)

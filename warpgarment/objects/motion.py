@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from warpgarment.errors import MeshError
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
 from warpgarment.io.surface.record import Surface
 
+from .clock import Clock, between
 from .status import RolloutStatus, Verdict
 
 
@@ -25,11 +28,13 @@ class GarmentMotion:
         fps: Frames per second.
         status: One `RolloutStatus` per frame, or empty if the motion was not simulated.
         name: Name of the garment, for messages and file names.
+        start: Time of the first frame [s].
+        last: When the last frame is reached, in frames after the first, as in `BodyMotion`.
         surface: Polygons, texture coordinates, materials and groups of the garment's file, for `save`; None: triangles.
 
     Raises:
-        MeshError: Shapes do not fit each other, an index is out of range, or the number of statuses is neither zero
-            nor the number of frames.
+        MeshError: Shapes do not fit each other, an index is out of range, a time is none, or the number of statuses is
+            neither zero nor the number of frames.
     """
 
     def __init__(
@@ -40,11 +45,13 @@ class GarmentMotion:
         status: Sequence[RolloutStatus] = (),
         name: str = "",
         *,
+        start: float = 0.0,
+        last: float | None = None,
         surface: Surface | None = None,
     ):
         self.vertices = checked_positions(vertices, frames=True, finite=False)
         self.faces = checked_faces(faces, self.vertices.shape[1])
-        self.fps = checked_fps(fps)
+        _, self.fps, self.start, self.last = Clock.checked(len(self.vertices), fps, start, last)
         self.status = list(status)
         self.name = str(name)
         self.surface = surface
@@ -65,15 +72,61 @@ class GarmentMotion:
         """Number of frames."""
         return len(self.vertices)
 
+    @property
+    def clock(self) -> Clock:
+        """When the frames are."""
+        return Clock.checked(self.frames, self.fps, self.start, self.last)
+
+    def resampled(self, fps: float, frames: int | None = None) -> GarmentMotion:
+        """The motion at another rate, as `BodyMotion.resampled`.
+
+        Between two frames the status is the worse of theirs: how deep the cloth is there is not measured. A motion that
+        ends with a frame of NaN does so again.
+
+        Args:
+            fps: New frames per second.
+            frames: No more than so many of the new frames; None: all.
+
+        Raises:
+            MeshError: The rate is not positive, or so much higher than the motion's that the frames would fill memory.
+        """
+        if checked_fps(fps) == self.fps:
+            return self
+        clock, places = self.clock.resampled(fps, frames, points=self.vertices.shape[1])
+        vertices = between(self.vertices, places)
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=(1, 2)))
+        if len(bad) and not np.isfinite(self.vertices[-1]).all():
+            vertices, places = vertices[: bad[0] + 1], places[: bad[0] + 1]
+            clock = clock if len(vertices) == clock.frames else Clock.checked(len(vertices), fps, self.start)
+        return self._on(clock, vertices, places)
+
+    def on_clock(self, clock: Clock) -> GarmentMotion:
+        """The motion at the frames of another clock, in a straight line between its own; before and after it stands
+        still. Between two frames the status is the worse of theirs."""
+        places = self.clock.places(clock.times)
+        return self._on(clock, between(self.vertices, places), places)
+
+    def _on(self, clock: Clock, vertices: np.ndarray, places: np.ndarray) -> GarmentMotion:
+        status = []
+        for frame, place in enumerate(places if self.status else ()):
+            near = (self.status[int(np.floor(place))], self.status[int(np.ceil(place))])
+            worse = max(near, key=lambda status: (not status.finite, status.max_penetration))
+            status.append(replace(worse, frame=frame))
+        times = {"start": clock.start, "last": clock.last}
+        return GarmentMotion(vertices, self.faces, clock.fps, status, self.name, **times, surface=self.surface)
+
     def save(self, path: str | os.PathLike) -> None:
         """Writes the motion, completely or not at all.
 
-        - ``.npz``: positions, faces, rate, status and name; `load` reads all formats, this one without loss;
-        - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres;
+        - ``.npz``: positions, faces, rate, start [s], status and name; `load` reads all formats, this one without loss;
+        - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres; time
+          codes are frames, and the first one is `start` x `fps`: 1001 for a shot that starts there;
         - ``.glb``, ``.gltf``: triangles with a morph target per frame, which an animation shows one after another;
-        - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it;
-        - no suffix, or a slash at the end: a folder ``frame_0000.obj``, ``frame_0001.obj``, ...; an existing folder is
-          replaced if it holds nothing else.
+        - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it; the
+          header says at which frame it starts;
+        - no suffix, or a slash at the end: a folder ``frame_1001.obj``, ``frame_1002.obj``, ..., the first number being
+          `start` x `fps` (with a warning where that is not whole); an existing folder is replaced if it holds nothing
+          else.
 
         Polygons, texture coordinates, materials (base colour, opacity, name of a picture) and groups that were read
         with the garment are written too, in the order of its file; materials of OBJ into a .mtl beside it. glTF has
@@ -92,9 +145,8 @@ class GarmentMotion:
         from warpgarment.io.files import write_motion
 
         name, extra = self.name or "garment", self._status_arrays()
-        write_motion(
-            path, MotionData(self.vertices, self.faces, self.fps, name=name, extra=extra, surface=self.surface)
-        )
+        more = {"name": name, "extra": extra, "surface": self.surface}
+        write_motion(path, MotionData.of(self.vertices, self.faces, self.clock, **more))
 
     @classmethod
     def load(
@@ -106,7 +158,7 @@ class GarmentMotion:
         mesh: str | None = None,
         up: str | None = None,
     ) -> GarmentMotion:
-        """Reads what `save` wrote, in any of its formats; only .npz keeps the statuses and the name.
+        """Reads what `save` wrote, in any of its formats; only .npz keeps the statuses, the name and all of the time.
 
         Args:
             path: File or folder.
@@ -117,10 +169,13 @@ class GarmentMotion:
             up: See `BodyMotion.load`.
 
         Raises:
-            MeshError: Not such a file.
+            MeshError: The file is not of its kind, is damaged, or has no rate.
             FileNotFoundError: There is no such file.
+
+        Warns:
+            UserWarning: Frames hold NaN or infinity without a status that says so.
         """
-        from warpgarment.io.files import rate_of, read_motion, whole_output
+        from warpgarment.io.files import rate_of, read_motion, start_of, whole_output
 
         path = Path(path)
         data = read_motion(path, unit=unit, mesh=whole_output(path, mesh), up=up)
@@ -135,9 +190,21 @@ class GarmentMotion:
                 rows = zip(*columns, verdicts, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
             name = str(data.extra["name"]) if "name" in data.extra else path.stem
-            return cls(data.vertices, data.faces, rate, status, name, surface=data.surface)
+            start = start_of(data, rate)
+            more: dict[str, Any] = {"start": start, "last": data.last, "surface": data.surface}
+            motion = cls(data.vertices, data.faces, rate, status, name, **more)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
+        said = np.array([not one.finite for one in status] or [False] * motion.frames)
+        bad = ~np.isfinite(motion.vertices).all(axis=(1, 2)) & ~said
+        if bad.any():
+            warnings.warn(
+                f"{path}: {bad.sum():,} of {motion.frames:,} frames hold NaN or infinity (first: frame "
+                f"{int(bad.argmax())}), and the file does not say that a rollout failed. It may be damaged.",
+                UserWarning,
+                stacklevel=2,
+            )
+        return motion
 
     def _status_arrays(self) -> dict[str, np.ndarray]:
         arrays = {"name": np.array(self.name)}

@@ -1,4 +1,4 @@
-"""How large a batch is: what forecasts of memory are made from."""
+"""Sizes of a batch, from which its memory is predicted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .pack import PackedBodies
 
 
 class Sizes(NamedTuple):
-    """Numbers of what a batch holds."""
+    """Numbers of garments, vertices and faces of a batch, and of the bodies under it."""
 
     garments: int
     vertices: int

@@ -43,7 +43,8 @@ class RolloutStatus:
         frame: Index in the motion, from 0.
         finite: Whether every position is finite.
         max_penetration: Depth of the garment's deepest point below the body's surface [m], at least 0. Points are its
-            vertices, and points of its edges and faces; see `warpgarment.kernels.sdf.surface_depth`.
+            vertices, and points of its edges and faces; see `warpgarment.kernels.sdf.surface_depth`. Of pieces that
+            ride on the cloth (`Garment.simulated`), which contacts do not push out, they are the vertices alone.
         poisson_iterations: Number of conjugate gradient iterations of the Poisson solve, the largest of all
             components; 0 if it was solved directly.
         collision_iterations: Number of conjugate gradient iterations of the collision refinement, the largest of all

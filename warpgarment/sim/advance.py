@@ -11,7 +11,7 @@ from .scene import Scene
 
 
 def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
-    """Algorithm 1: frame t, and the bodies at t+1 [U,3], to frame t+1. Only a CPU looks at a number on the way."""
+    """Computes frame t+1 from frame t and the bodies at t+1 [m], shape [U,3]. The host does not wait for a GPU."""
     before = now.positions
     features = scene.features(before, now.body, next_body)
     stacked = now.history.stacked(features)

@@ -1,4 +1,4 @@
-"""What users hand to the simulator, brought into one form: lists of garments and bodies, arrays that are copies."""
+"""Converts arguments of the simulator to one form: lists of garments and bodies, and arrays that are copies."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ from warpgarment.objects.garment import Garment
 
 
 def as_array(values: Any) -> np.ndarray:
-    """Anything array-like as a float32 copy, so that callers may reuse theirs."""
+    """Copies a tensor, array or nested list to a float32 array, so that the caller may reuse its own."""
     if isinstance(values, torch.Tensor):
         values = values.detach().cpu().numpy()
     return np.array(values, dtype=np.float32)
 
 
 def listed(value: Any, kind: type) -> tuple[list, bool]:
-    """A list of what is one or several of a kind, and whether it was one.
+    """Returns the argument as a list, and whether a single object was given.
+
+    Args:
+        value: An object of class `kind`, or a sequence of them.
+        kind: The class.
 
     Raises:
-        ValueError: An empty list.
-        TypeError: Another kind.
+        ValueError: The sequence is empty.
+        TypeError: An object is of another class.
     """
     if isinstance(value, kind):
         return [value], True
@@ -38,10 +42,17 @@ def listed(value: Any, kind: type) -> tuple[list, bool]:
 
 
 def per_garment(value: Any, kind: type, count: int, name: str) -> list:
-    """One for each garment, of what is one for all or a list.
+    """Returns a list with one object for each garment.
+
+    Args:
+        value: One object of class `kind` for all garments, or a sequence with one for each.
+        kind: The class.
+        count: Number of garments.
+        name: Plural noun for the objects, for messages.
 
     Raises:
-        ValueError, TypeError: As `listed`, and lists of another length.
+        ValueError: The sequence is empty, or its length is not `count`.
+        TypeError: An object is of another class.
     """
     values, single = listed(value, kind)
     if single:
@@ -54,21 +65,21 @@ def per_garment(value: Any, kind: type, count: int, name: str) -> list:
 def known_frames(
     garments: Sequence[Garment], single: bool, first_vertices: Any, history: Any, history_length: int
 ) -> np.ndarray:
-    """Frames that a simulation begins with, packed: the rest positions, `first_vertices`, or a history.
+    """The frames with which a simulation begins, packed: the rest positions, `first_vertices`, or a history.
 
     Args:
         garments: The batch.
-        single: Whether the caller gave one garment, and so one array, not a list.
-        first_vertices: One frame [V,3] per garment, or None.
-        history: [H,V,3] per garment, or None.
-        history_length: H.
+        single: Whether the caller gave one garment, and so one array instead of a list.
+        first_vertices: First frame of each garment [m], shape [V,3]; or None.
+        history: First H frames of each garment [m], shape [H,V,3]; or None.
+        history_length: Number of frames H of a history.
 
     Returns:
-        float32 [K,V,3] with K = 1 or H.
+        Positions [m], float32 [K,V,3] with K = 1 or H.
 
     Raises:
-        ValueError: Both, other shapes, or lists of another length than the batch.
-        MeshError: Positions that are not finite.
+        ValueError: Both are given, an array has another shape, or a list does not have one array for each garment.
+        MeshError: Positions are not finite.
     """
     if first_vertices is not None and history is not None:
         raise ValueError("give first_vertices or history, not both: a history begins with the first frame")
@@ -94,7 +105,7 @@ def known_frames(
 
 
 def counted(frames: range, progress: bool) -> Any:
-    """The frames, with a progress bar if wanted."""
+    """The numbers of the frames, with a progress bar if `progress` is set."""
     if not progress:
         return frames
     from tqdm import tqdm

@@ -1,4 +1,4 @@
-"""The bodies of a batch in motion: one set of search trees, which follow wherever they are needed."""
+"""The moving bodies of a batch, with one set of search trees that is updated when a caller needs other positions."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from warpgarment.objects.pack import PackedBodies
 
 
 class MovingBodies:
-    """Packed bodies whose search trees are moved only if the last caller had them elsewhere.
+    """Packed bodies whose search trees are updated only if the positions differ from those of the last call.
 
     Args:
         vertices: Bodies in the first frame [m], packed, shape [U,3].
         packed: Topology of the bodies.
 
     Attributes:
-        placed: The positions to which the trees were last moved; None where that is not known.
+        placed: The positions of the last update [m], shape [U,3]; None if they are not known.
     """
 
     def __init__(self, vertices: torch.Tensor, packed: PackedBodies) -> None:

@@ -1,4 +1,4 @@
-"""One frame of a batch on the device, the next one from it, and reading what the host wants to know of it."""
+"""One frame of a batch on the device."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from .history import History
 
 
 class Frame(NamedTuple):
-    """One frame of a batch: tensors on the device alone, so that a frame can follow another without the host."""
+    """One frame of a batch. All of it is on the device, so that the next frame can be computed without the host."""
 
-    positions: torch.Tensor  # [V,3] packed; of a garment that failed, where it was last finite
-    body: torch.Tensor  # [U,3] packed
-    features: torch.Tensor  # of the history, [F,H-1,34]
-    velocities: torch.Tensor  # of the history, [C,H-1,3]
-    finite: torch.Tensor  # bool [B]
-    depth: torch.Tensor  # [B] metres
+    positions: torch.Tensor  # [V,3] packed [m]; for a garment that failed, its last finite positions
+    body: torch.Tensor  # [U,3] packed [m]
+    features: torch.Tensor  # [F,H-1,34] of the history
+    velocities: torch.Tensor  # [C,H-1,3] of the history [m/frame]
+    finite: torch.Tensor  # bool [B], whether a garment has been finite so far
+    depth: torch.Tensor  # [B] depth of the deepest point of each garment in its body [m]
     solves: (
         torch.Tensor
-    )  # float64 [2,3]: Poisson and collisions; iterations, components stopped, largest error of these
+    )  # float64 [2,3]: for Poisson and collisions, iterations, number of stopped components, their largest error
 
     @property
     def history(self) -> History:
-        """What the network remembers."""
+        """The features and velocities of earlier frames."""
         return History(self.features, self.velocities)
 
     @property
     def outcome(self) -> tuple[torch.Tensor, ...]:
-        """What `read` reads."""
+        """The tensors that `recording.read` copies to the host."""
         return self.positions, self.finite, self.depth, self.solves

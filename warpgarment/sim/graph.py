@@ -1,13 +1,13 @@
-"""A frame as one CUDA graph: the network's kernels and Warp's, recorded once and replayed with one call.
+"""A frame as one CUDA graph: the kernels of the network and of Warp, recorded once and replayed with one call.
 
-A frame of a small garment is some hundred launches of a few microseconds each, which cost the host more than the GPU.
-Nothing in a frame waits for the device, and a scene's shapes never change, so the whole frame can be recorded. A graph
-reads and writes fixed memory: inputs are copied in and results out, so that states stay values.
+A frame of a small garment is some hundred launches of a few microseconds each, which take the host longer than the GPU.
+Nothing in a frame waits for the device, and the shapes of a scene never change, so the whole frame can be recorded. A
+graph reads and writes fixed memory. Inputs are copied in and results out, so that states stay values.
 
-    frame, frame, frame       run as they are: modules are loaded, workspaces made, the allocators warm
-    record, replay, replay    from then on
+    frame, frame, frame       without a graph, to load modules, make workspaces and warm the allocators
+    record, replay, replay    all later frames
 
-A recording that fails says why in a RuntimeWarning, and frames go on as before it.
+If a recording fails, a RuntimeWarning gives the reason, and frames run without a graph.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Record = Callable[[Callable[[], Frame]], tuple[Frame, Callable[[], None]]]
 def cuda_graph(run: Callable[[], Frame]) -> tuple[Frame, Callable[[], None]]:
     """Records a call as a CUDA graph without running it.
 
-    Warp launches on torch's current stream (`kernels/launch.py`), which is the stream being captured; Warp is told of
-    the capture so that it keeps the modules of its kernels.
+    Warp launches on torch's current stream (`kernels/launch.py`), which is the stream being captured. The capture is
+    also registered with Warp, which then keeps the modules of its kernels.
 
     Returns:
-        The tensors that a replay fills in, and the replay.
+        The tensors that a replay fills, and a function that replays the graph.
     """
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=torch.cuda.Stream(), capture_error_mode="thread_local"):
@@ -50,11 +50,11 @@ def cuda_graph(run: Callable[[], Frame]) -> tuple[Frame, Callable[[], None]]:
 
 
 class GraphedFrames:
-    """Runs `advance` for the frames of one scene, first as it is and then as replays.
+    """Runs `advance` for the frames of one scene: the first ones directly, all others by replaying a graph.
 
     Args:
-        scene: The scene, whose bodies a frame moves.
-        record: Makes a recording, as `cuda_graph`.
+        scene: The scene; a frame moves its bodies.
+        record: Function that records a call, such as `cuda_graph`.
     """
 
     def __init__(self, scene: Scene, record: Record = cuda_graph) -> None:
@@ -64,7 +64,7 @@ class GraphedFrames:
         self._recorded: tuple[Frame, torch.Tensor, Frame, Callable[[], None]] | None = None
 
     def __call__(self, now: Frame, next_body: torch.Tensor) -> Frame:
-        """One frame on; the result is the caller's."""
+        """Computes the next frame, in memory that no later frame changes."""
         if self._recorded is None:
             self.seen += 1
             if self.failed or self.seen <= WARM_UP or not self._record(now, next_body):
@@ -80,17 +80,17 @@ class GraphedFrames:
 
     @property
     def recorded(self) -> bool:
-        """Whether frames are replayed from now on."""
+        """Whether the graph has been recorded, so that frames are replayed."""
         return self._recorded is not None
 
     def _record(self, now: Frame, next_body: torch.Tensor) -> bool:
         before, body = type(now)(*(tensor.clone() for tensor in now)), next_body.clone()
         self.scene.bodies.at(now.body)
-        self.scene.bodies.placed = before.body  # where a replay finds them
+        self.scene.bodies.placed = before.body  # the trees before each replay
         try:
-            with torch.cuda.device_of(now.positions):  # nothing where that is no GPU
+            with torch.cuda.device_of(now.positions):  # does nothing on a CPU
                 after, replay = self.record(lambda: advance(self.scene, before, body))
-        except Exception as error:  # whatever CUDA, torch or Warp refuse to capture
+        except Exception as error:  # anything that CUDA, torch or Warp cannot capture
             self.failed = True
             reason = str(error).strip().splitlines() or [""]
             warnings.warn(

@@ -1,12 +1,12 @@
-"""How much memory a simulation will take, before any of it is taken.
+"""Predicts the memory of a simulation before any of it is allocated.
 
     memory = wg.memory.predict(garments, bodies, network.config, face_splits=2)
     print(memory)      # 1.3 GB: geodesic weights 805 MB, network 351 MB, ...
 
-What lasts (matrices over pairs of faces or vertices above all) is counted as it is laid out; what a frame needs in
-passing is the largest of its stages, by factors that were measured with torch's profiler. What the network needs is
-for its kind to say (`Architecture.memory`). Predictions lie within a factor of 1.5 of what torch allocates, from 500
-faces on. The CUDA context and libraries (some 0.5 GB) come on top.
+Lasting memory (above all matrices over pairs of faces or vertices) is counted from the sizes of its arrays. Temporary
+memory is that of the largest stage of a frame, by factors measured with torch's profiler. The memory of the network is
+predicted by its kind (`Architecture.memory`). From 500 faces on, predictions lie within a factor of 1.5 of what torch
+allocates. The CUDA context and libraries take some 0.5 GB more.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ from warpgarment.objects.sizes import Sizes
 from warpgarment.sim.stages.correct import Corrector
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
-PER_FACE, PER_VERTEX = 400, 800  # bytes: rest frames, indices; sparse matrices and vectors of the solvers
-PER_BODY_FACE, PER_BODY_VERTEX = 400, 60  # bytes: search tree with winding numbers; positions of two frames
-GRAPHED = 3  # copies of the history on a GPU: that of a state, and what a graph reads and writes
-INVERTING = 3  # float64 matrices while the compliance of a component is made
-LANES = 16  # rows of compliance matrices are padded to a multiple of it
-POISSON_FACTOR, COLLISION_FACTOR = 36.0, 85.0  # bytes for V log2 V of a component, for substitution
-EXPLICIT_FACTOR = 80.0  # bytes for V^1.5, inverted
-FACTOR_ENTRY = 12  # bytes
+PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
+PER_BODY_FACE, PER_BODY_VERTEX = 400, 60  # bytes of the search tree with winding numbers; of positions in two frames
+GRAPHED = 3  # copies of the history on a GPU: of a state, and the input and output of a graph
+INVERTING = 3  # number of float64 matrices while the compliance of a component is made
+LANES = 16  # rows of compliance matrices are padded to a multiple of this
+POISSON_FACTOR, COLLISION_FACTOR = 36.0, 85.0  # bytes of a factor for substitution, per V log2 V of a component
+EXPLICIT_FACTOR = 80.0  # bytes of an inverted factor, per V^1.5 of a component
+FACTOR_ENTRY = 12  # bytes of an entry of a factor
 MORE_SPLITS = (2, 4, 8, 16, 32, 64)
 
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """Bytes by what they are for."""
+    """Bytes by purpose."""
 
     parts: dict[str, int]
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Sum of all parts."""
         return sum(self.parts.values())
 
     def __str__(self) -> str:
@@ -69,18 +69,19 @@ def predict(
     device: torch.device | str = "cpu",
     correctors: Sequence[Corrector] = (),
 ) -> Memory:
-    """What a batch takes at its peak, on its device.
+    """Predicts the peak memory of a batch on its device.
 
     Args:
-        garments: The batch; one that occurs several times shares what is constant.
-        bodies: Under them, each once.
-        config: Of the network.
-        face_splits, half: As in `Simulator`.
-        device: On a CPU, the distances that weights are made from count too.
-        correctors: What changes positions after contact; each is asked for its own memory.
+        garments: The batch; the same object several times shares its constants.
+        bodies: The bodies of the batch, each once.
+        config: Settings of the network.
+        face_splits: Number of subsets of faces, as in `Simulator.rollout`.
+        half: Whether the network runs in bfloat16, as in `Simulator`.
+        device: Device of the simulation; on a CPU, the distances from which weights are made count too.
+        correctors: Correctors of the simulation, each of which predicts its own memory.
 
     Returns:
-        Bytes; nothing is computed over pairs of faces, and nothing allocated.
+        Bytes by purpose. The prediction itself allocates no arrays over pairs of faces.
     """
     cpu = torch.device(device).type == "cpu"
     unique = list({id(garment): garment for garment in garments}.values())
@@ -112,7 +113,7 @@ def predict(
 
 
 def free(device: torch.device | str) -> int | None:
-    """Bytes that can still be allocated; None where that is not known (a CPU that is not Linux's)."""
+    """Bytes that can still be allocated; None if that is not known, as on a CPU without /proc/meminfo."""
     device = torch.device(device)
     if device.type == "cuda":
         unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # kept by torch for reuse
@@ -134,10 +135,10 @@ def check(
     device: torch.device | str = "cpu",
     correctors: Sequence[Corrector] = (),
 ) -> None:
-    """Refuses a batch that will not fit, before its memory is taken. Arguments as in `predict`.
+    """Checks that a batch fits on its device, before memory is allocated. The arguments are those of `predict`.
 
     Raises:
-        NotEnoughMemory: Names what needs how much, the limit, and what makes the batch fit.
+        NotEnoughMemory: It does not fit; the message names the parts, the limit, and settings with which it would fit.
     """
     available = free(device)
     if available is None:
@@ -179,7 +180,7 @@ def _factors(garments: Sequence[Garment], cpu: bool) -> int:
 
 
 def _compliance(garments: Sequence[Garment]) -> tuple[int, int, int]:
-    """Bytes of the compliance matrices and of their scratch, and entries of the largest, as `Compliance.build`."""
+    """Bytes of the compliance matrices and of their scratch, and entries of the largest, as in `Compliance.build`."""
     used = needed = largest = 0
     known = set()
     for garment in garments:
@@ -196,7 +197,7 @@ def _compliance(garments: Sequence[Garment]) -> tuple[int, int, int]:
 
 
 def _largest(high: int, fits: Callable[[int], bool]) -> int:
-    """The largest number up to `high` that fits, 0 if none does; whatever fits, fewer fit too."""
+    """The largest number up to `high` that fits, 0 if none does. If a number fits, all smaller ones must fit too."""
     low = 0
     while low < high:
         middle = (low + high + 1) // 2
@@ -205,7 +206,7 @@ def _largest(high: int, fits: Callable[[int], bool]) -> int:
 
 
 def _size(n: float) -> str:
-    """Bytes as people write them."""
+    """A number of bytes with its unit, as text."""
     for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
         if n >= scale:
             return f"{n / scale:.1f} {unit}"

@@ -1,12 +1,12 @@
-"""Pins: garment vertices that stay where they were on the body (waistbands, straps).
+"""Pins: garment vertices that keep their place on the body (waistbands, straps).
 
-In the first frame each pin finds its nearest body face and keeps two things: the barycentric coordinates of the
-nearest point, and the offset from it, written in the face's own orthonormal frame [e1/|e1|, n x e1/|e1|, n] (of which
-the part along the normal n is all, except where the nearest point lies on an edge). In every later frame
+In the first frame the nearest body face of each pin is found, with the barycentric coordinates b of the nearest point
+and the offset from it in the orthonormal frame [t, n x t, n] of the face, where t = e1/|e1|. (The offset is along the
+normal n, unless the nearest point lies on an edge.) In every later frame
 
     target = sum_k b_k U_k + offset_1 t + offset_2 (n x t) + offset_3 n
 
-so the first frame is reproduced exactly, and what follows comes from the body alone.
+so pins have their given positions in the first frame, and then depend on the body alone.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class BodyPins:
     """Pins tied to the surface of packed bodies.
 
     Args:
-        positions: Of the pinned vertices in the first frame [m], shape [P,3].
+        positions: Positions of the pinned vertices in the first frame [m], shape [P,3].
         bodies: The bodies in that frame.
         body_of_pin: Body of each pin, int32, shape [P].
     """
@@ -38,7 +38,7 @@ class BodyPins:
         self.offset = (_surface_frames(triangles).mT @ (positions - foot)[..., None]).squeeze(-1)
 
     def targets(self, body_vertices: torch.Tensor) -> torch.Tensor:
-        """Where the pins are when the bodies are there; [U,3] -> [P,3] in metres."""
+        """Positions of the pins for given positions of the bodies; [U,3] -> [P,3] in metres."""
         triangles = body_vertices[self.corners]
         foot = (self.barycentric[..., None] * triangles).sum(dim=1)
         return foot + (_surface_frames(triangles) @ self.offset[..., None]).squeeze(-1)
@@ -47,10 +47,10 @@ class BodyPins:
 def mean_response(
     rest_vertices: np.ndarray, faces: np.ndarray, pins: np.ndarray, face_component: np.ndarray, stiffness: float = 1e3
 ) -> np.ndarray:
-    """How a garment that is held by its pins gives way when its mean is moved: the cheapest field with unit mean.
+    """Displacement of a pinned garment per displacement of its mean: the field u of least energy with unit mean.
 
-    Pins fix the translation of the Poisson solve, and the predicted velocity q would be lost. Among all V the one that
-    minimises the same energy under the extra condition mean(V) = z + q is V_pinned + u (z + q - mean(V_pinned)), with
+    Pins fix the translation of the Poisson solve, and the predicted velocity q would be lost. The minimiser of the same
+    energy under the additional condition mean(V) = z + q is V_pinned + u (z + q - mean(V_pinned)), with
 
         u = (L + W)^-1 c / (c^T (L + W)^-1 c),        c: share of each vertex in the mean face centroid
 
@@ -58,10 +58,10 @@ def mean_response(
 
     Args:
         rest_vertices: Rest positions [m], shape [V,3].
-        faces: Shape [F,3].
-        pins: Pinned vertices, shape [P]; may be empty.
+        faces: Vertex indices, shape [F,3].
+        pins: Indices of pinned vertices, shape [P]; may be empty.
         face_component: Connected component of each face, shape [F].
-        stiffness: Of a pin, in units of the mean diagonal entry of the Laplacian.
+        stiffness: Stiffness of a pin, in units of the mean diagonal entry of the Laplacian.
 
     Returns:
         u, float32 [V]; zero on components without pins.

@@ -1,8 +1,8 @@
-"""One batch of garments on bodies: what stays the same during a simulation, and the stages of a frame (`stages/`).
+"""One batch of garments on bodies: the constants of a simulation, and the stages of a frame (`stages/`).
 
-The stages of Algorithm 1, all on packed arrays: `features` before the network, `predict`, `reconstruct` (singular
-values, Poisson), `contact` (collisions) and `correct` (nothing by itself) after it. A scene holds no garment positions;
-those are in `simulator.SimulationState`.
+The stages of Algorithm 1 work on packed arrays: `features`, `predict` (the network), `reconstruct` (singular values and
+Poisson solve), `contact` (collisions) and `correct` (does nothing by default). A scene holds no garment positions; they
+are in `state.SimulationState`.
 """
 
 from __future__ import annotations
@@ -30,36 +30,39 @@ from warpgarment.sim.stages.reconstruct import Reconstruct
 
 from . import memory
 from .bodies import MovingBodies
+from .brought import Brought
 from .surface import Surface
 from .timing import Timings
 
-FARTHEST = 1.0  # metres: a garment none of whose vertices is nearer to its body is in the wrong place or unit
+FARTHEST = 1.0  # metres; a garment whose nearest vertex is farther from its body has a wrong position or unit
 
 
 class Scene:
     """Garments, bodies, and the stages of a frame.
 
     Args:
-        garments: In the order of the batch.
+        garments: The garments, in the order of the batch.
         bodies: Topology of the bodies, and which garment is on which.
         body_vertices: Bodies in the first frame [m], packed, shape [U,3].
         first_vertices: Garments in the first frame [m], packed, shape [V,3].
-        network: Reads its config; run by `predict`.
-        face_splits: As in `GarmentNetwork.layout`.
-        epsilon: Distance that collision refinement keeps from the body [m]; None: see `clearance`.
+        network: The network that `predict` runs.
+        face_splits: Number of subsets of faces, as in `GarmentNetwork.layout`.
+        epsilon: Distance that collision refinement keeps from the body [m]; None for the default of `clearance`.
         collision_passes: Largest number of refinements in a frame.
         half: Whether the transformer runs in bfloat16.
-        timings: Where the stages add up how long they took.
-        contact_sources: What finds contacts, such as `BodyContacts()`.
+        timings: Times of the stages, to which each stage adds its own.
+        contact_sources: Objects that find contacts, such as `BodyContacts()`.
         correctors: What changes positions after contact.
+        brought: What users brought, where it is more than `garments`.
 
     Attributes:
-        contact_sources: A list, which may grow until the first frame; so is `correctors`.
+        contact_sources: List of contact sources; more may be appended before the first frame.
+        correctors: List of correctors; more may be appended before the first frame.
 
     Raises:
         MeshError: A garment is more than 1 m from its body.
         NotEnoughMemory: The batch would not fit on the device.
-        ValueError: The network reads what a simulation does not know yet.
+        ValueError: The network reads inputs that simulations do not have yet.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class Scene:
         timings: Timings,
         contact_sources: Sequence[ContactSource] = (BodyContacts(),),
         correctors: Sequence[Corrector] = (),
+        brought: Brought | None = None,
     ) -> None:
         if network.reads:
             raise ValueError(f"the network reads {', '.join(sorted(network.reads))}, which simulations do not give yet")
@@ -92,6 +96,7 @@ class Scene:
             device=device,
             correctors=self.correctors,
         )
+        self.brought, self.topology = brought, bodies
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
         self.bodies = MovingBodies(body_vertices, bodies)
@@ -126,7 +131,7 @@ class Scene:
         self.correct = Correct(self.correctors, packed, self.contact.depth, timings)
 
     def _refuse_far(self, vertices: torch.Tensor, body_of_vertex: torch.Tensor) -> None:
-        """Raises MeshError for a garment that is nowhere near its body."""
+        """Raises MeshError for a garment whose vertices are all more than `FARTHEST` from its body."""
         assert self.bodies.placed is not None
         distance = self.bodies.at(self.bodies.placed).query(vertices, body_of_vertex).distance
         for number, of_garment in enumerate(distance.split(_lengths(self.packed.vertex_offsets))):
@@ -140,7 +145,7 @@ class Scene:
                 )
 
     def predict(self, inputs: FrameInputs) -> Step | VertexStep:
-        """The network, step 2: what happens next."""
+        """Step 2 of a frame: the network predicts the step to t+1."""
         with self.timings("network"):
             return self.network.predict(inputs, self.layout, bfloat16=self.half)
 

@@ -1,7 +1,7 @@
 """The simulator: garments on moving bodies, frame by frame (Algorithm 1).
 
-`rollout` takes whole motions, `start` and `step` take bodies as they come; both run the same code on a packed batch,
-and one garment is a batch of one.
+`rollout` takes whole motions, `start` and `step` take one body pose at a time. Both run the same code on a packed
+batch; one garment is a batch of one.
 """
 
 from __future__ import annotations
@@ -30,10 +30,12 @@ from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
 from .arguments import as_array, counted, known_frames, listed, per_garment
+from .brought import Brought
 from .frame import Frame
 from .graph import GraphedFrames
 from .history import History
-from .recording import READ_EVERY, Recording
+from .results.recording import READ_EVERY, Recording, seen
+from .results.shot import Rate, bodies_of_shot, brought_to_shot, frames_needed, rates_of
 from .scene import Scene
 from .state import SimulationState, Status, Vertices
 from .timing import Timings
@@ -43,22 +45,22 @@ class Simulator:
     """Moves garments with a network.
 
     Args:
-        network: Moved to the device, and used in evaluation mode whatever mode it is in.
-        device: "cpu", "cuda", ...; None takes CUDA where there is any.
-        epsilon: Distance that collision refinement keeps between vertices and body [m]. None: 4 mm, or a fifth of a
-            garment's mean edge length if that is more, since a body shows through between the vertices of coarse cloth.
-        collision_passes: Collision refinement is repeated while anything of a garment is more than 0.1 mm deep, at most
-            so often per frame; 0 leaves it out.
-        half: Run the transformer in bfloat16: faster on recent GPUs. Geometry stays in float32.
-        graph: Replay frames as one CUDA graph, after the first few (`graph.py`). None: on CUDA, and a graph that
-            cannot be made is a RuntimeWarning. Off while `timings.synchronise` is set, which measures inside a frame.
+        network: The network. It is moved to the device, and runs in evaluation mode.
+        device: Device, "cpu", "cuda", ...; None takes a GPU if there is one.
+        epsilon: Distance that collision refinement keeps between vertices and body [m]. None takes 4 mm, or a fifth of
+            a garment's mean edge length if that is more, since a body shows through between the vertices of coarse
+            cloth.
+        collision_passes: Largest number of collision refinements per frame. They are repeated while any point of a
+            garment is more than 0.1 mm deep; 0 leaves them out.
+        half: Whether the transformer runs in bfloat16, which is faster on recent GPUs. Geometry stays in float32.
+        graph: Whether frames after the first few are replayed as one CUDA graph (`graph.py`). None does so on CUDA. A
+            graph that cannot be made is a RuntimeWarning. Frames are not replayed while `timings.synchronise` is set.
 
     Attributes:
-        timings: Seconds per stage since the simulator was made: a dict, plus `synchronise`, which must be set for it to
-            be filled on CUDA.
-        contact_sources: What finds contacts in the simulations that are started from now on: a list, at first
-            `[BodyContacts()]`.
-        correctors: What changes positions after contact, in order: a list, empty at first.
+        timings: Seconds per stage since the simulator was made, a dict. On CUDA, times are measured only while its
+            attribute `synchronise` is set.
+        contact_sources: List of contact sources for simulations that are started later, at first `[BodyContacts()]`.
+        correctors: List of correctors for simulations that are started later, in their order, at first empty.
     """
 
     def __init__(
@@ -92,10 +94,12 @@ class Simulator:
         Args:
             name: "default" (which depends on the device), the name of a network that ships, a checkpoint file, a folder
                 that holds one, or a Hugging Face repository `owner/name[@revision]` (extra `hub`).
-            device: As in the constructor, and so are the options.
+            device: Device, as in the constructor.
+            options: Further arguments of the constructor.
 
         Raises:
-            CheckpointError, MissingExtra: There is no such network, it is damaged, or cannot be fetched.
+            CheckpointError: There is no such network, it is damaged, or it cannot be fetched.
+            MissingExtra: The name can only be a repository, and huggingface-hub is not installed.
         """
         return cls(checkpoint.load(checkpoint.find(name, device=device)), device, **options)
 
@@ -108,6 +112,7 @@ class Simulator:
         first_vertices: Any = None,
         history: Any = None,
         frames: int | None = None,
+        out_fps: Rate = None,
         face_splits: int = 1,
         progress: bool = False,
     ) -> GarmentMotion: ...
@@ -121,6 +126,7 @@ class Simulator:
         first_vertices: Any = None,
         history: Any = None,
         frames: int | None = None,
+        out_fps: Rate = None,
         face_splits: int = 1,
         progress: bool = False,
     ) -> list[GarmentMotion]: ...
@@ -133,33 +139,42 @@ class Simulator:
         first_vertices: Any = None,
         history: Any = None,
         frames: int | None = None,
+        out_fps: Rate = None,
         face_splits: int = 1,
         progress: bool = False,
     ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
         Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
-        network's rate. Garments whose motion is shorter stop earlier; one that stops being finite ends with that frame,
-        which holds NaN, with a status that says so and a RuntimeWarning.
+        network's rate. Results start when their body starts, and last as long. All vertices of a garment come back in
+        their order: joined seams are simulated once, small loose pieces are carried by the cloth
+        (`Garment.simulated`). Garments whose motion is shorter stop earlier; one that stops being finite ends with that
+        frame, which holds NaN, with a status that says so and a RuntimeWarning.
 
         Args:
-            garment: One or a list.
-            body: One, on which all garments are, or a list with one for each garment (which may repeat).
+            garment: One garment, or a list.
+            body: One body for all garments, or a list with one for each garment (the same object may repeat).
             first_vertices: Positions in the first frame [m], shape [V,3] (or a list), where they differ from the rest
                 positions `garment.vertices`: see `wg.fit`.
             history: Known first frames, shape [H,V,3] (or a list) with H the network's `history`, of the body's first H
                 frames. They are returned as they are, and the simulation goes on from them.
-            frames: Stop after so many frames, known ones included.
-            face_splits: Show the network so many interleaved subsets of the faces, one at a time: less time and memory.
-            progress: Show a progress bar.
+            frames: Largest number of frames of the result, known ones included; None for the whole motion.
+            out_fps: Frames per second of the result: None for the network's; "body" for those of each body, frame by
+                frame; or a number. Between the network's frames positions are interpolated in time, moved out of the
+                body at that time, and measured.
+            face_splits: Number of interleaved subsets of the faces that the network sees one at a time. More subsets
+                take less time and memory.
+            progress: Whether to show a progress bar.
 
         Returns:
-            A `GarmentMotion` at the network's rate, or a list of them for a list of garments.
+            A `GarmentMotion`, or a list of them for a list of garments.
 
         Raises:
-            ValueError: Lists of different lengths, arrays of other shapes, both `first_vertices` and `history`.
+            ValueError: Lists have different lengths, arrays have other shapes, or both `first_vertices` and `history`
+                are given.
             MeshError: A garment is more than 1 m from its body, or positions are not finite.
-            NotEnoughMemory: The batch would not fit on the device; names the setting with which it would.
+            NotEnoughMemory: The batch would not fit on the device; the message names settings with which it would.
+            UsageError: `frames` is less than 1.
         """
         garments, single = listed(garment, Garment)
         bodies = per_garment(body, BodyMotion, len(garments), "bodies")
@@ -167,10 +182,15 @@ class Simulator:
         number = {id(b): i for i, b in enumerate(unique)}
         if frames is not None and frames < 1:
             raise UsageError(f"frames must be at least 1, got {frames}")
-        motions = [b.resampled(self.network.config.fps, frames) for b in unique]
-        known = self._known(garments, single, first_vertices, history)
-        given = known.shape[0]
-        lengths = [min(motions[number[id(b)]].frames, frames or 2**62) for b in bodies]
+        fps = self.network.config.fps
+        rates = rates_of(unique, out_fps, fps)
+        needed = [frames_needed(frames, rate, fps) for rate in rates]
+        motions = [b.resampled(fps, count) for b, count in zip(unique, needed, strict=True)]
+        brought = self._brought(garments, single, first_vertices, history)
+        given = len(brought.known)
+        on = [number[id(b)] for b in bodies]
+        shot = bodies_of_shot(unique, rates, frames, garments, on) if any(rate != fps for rate in rates) else None
+        lengths = [min(motions[i].frames, needed[i] or 2**62) for i in on]
         if min(lengths) < given:
             raise ValueError(f"history has {given} frames, the shortest motion (or frames=) {min(lengths)}")
 
@@ -180,17 +200,17 @@ class Simulator:
         packed = PackedBodies.pack(
             [m.faces for m in motions],
             [m.vertices.shape[1] for m in motions],
-            [number[id(b)] for b in bodies],
+            on,
             self.device,
         )
         first = [body_at(frame) for frame in range(given)]
-        states = self._begin(garments, single, packed, known, first, face_splits)
+        states = self._begin(brought, single, packed, first, face_splits)
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         with evaluating(self.network):
             for frame in counted(range(total), progress):
                 state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
-                if not recording.add(state.now.outcome, last=frame == total - 1):
+                if not recording.add(seen(state.scene, state.now), last=frame == total - 1):
                     break
         results = []
         for i, (worn, statuses) in enumerate(zip(garments, recording.statuses, strict=True)):
@@ -198,8 +218,14 @@ class Simulator:
                 label = worn.name or f"garment {i}"
                 warnings.warn(f"{label} stopped: {statuses[-1].message}", RuntimeWarning, stacklevel=2)
             moved = recording.positions[i][: len(statuses)]
-            fps, surface = self.network.config.fps, worn.surface
-            results.append(GarmentMotion(moved, worn.faces, fps, statuses, worn.name, surface=surface))
+            if history is not None:
+                moved[:given] = brought.given[i]
+            clock = motions[on[i]].clock
+            last = clock.last if len(moved) == clock.frames else None
+            more = {"start": clock.start, "last": last, "surface": worn.surface}
+            results.append(GarmentMotion(moved, worn.faces, fps, statuses, worn.name, **more))
+        if shot is not None:
+            results = brought_to_shot(states[0].scene, results, on, shot, motions, rates, frames)
         return results[0] if single else results
 
     @overload
@@ -230,17 +256,17 @@ class Simulator:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
         Args:
-            garment: One or a list.
-            body_vertices: The body in the first frame [m], shape [U,3]; a list, one for each garment, or one for all.
-            body_faces: Its faces, shape [G,3]; a list where `body_vertices` is one.
-            first_vertices: As in `rollout`.
-            face_splits: As in `rollout`.
+            garment: One garment, or a list.
+            body_vertices: Body in the first frame [m], shape [U,3], for all garments; or a list with one for each.
+            body_faces: Vertex indices of its faces, shape [G,3]; a list if `body_vertices` is one.
+            first_vertices: Positions in the first frame, as in `rollout`.
+            face_splits: Number of subsets of the faces, as in `rollout`.
 
         Returns:
             The state at frame 0.
 
         Raises:
-            ValueError, MeshError, NotEnoughMemory: As `rollout`.
+            ValueError, MeshError, NotEnoughMemory: As for `rollout`.
         """
         garments, single = listed(garment, Garment)
         if isinstance(body_vertices, (list, tuple)):
@@ -256,25 +282,25 @@ class Simulator:
             BodyMotion(as_array(v)[None], f, self.network.config.fps) for v, f in zip(shapes, faces, strict=True)
         ]
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
-        known = self._known(garments, single, first_vertices, None)
+        brought = self._brought(garments, single, first_vertices, None)
         first = self._positions([b.vertices[0] for b in checked])
-        return self._begin(garments, single, packed, known, [first], face_splits)[0]
+        return self._begin(brought, single, packed, [first], face_splits)[0]
 
     def step(
         self, state: SimulationState[Vertices, Status], next_body_vertices: Any
     ) -> SimulationState[Vertices, Status]:
-        """One frame on.
+        """Simulates the next frame.
 
         Args:
-            state: From `start` or `step`; stays as it is.
-            next_body_vertices: The body in the next frame [m], shape [U,3]; a list where `start` was given one. Copied.
+            state: A state from `start` or `step`; it is not changed.
+            next_body_vertices: Body in the next frame [m], shape [U,3]; a list if `start` was given one. It is copied.
 
         Returns:
-            The next state. Once a garment is not finite it stays so, and its vertices are NaN.
+            The next state. A garment that is not finite stays so, and its vertices are NaN.
 
         Raises:
-            ValueError: Another number of bodies or vertices than at the start.
-            MeshError: Positions that are not finite.
+            ValueError: The number of bodies or of their vertices differs from that at the start.
+            MeshError: Positions are not finite.
         """
         listed = isinstance(next_body_vertices, (list, tuple))
         arrays = [as_array(v) for v in (next_body_vertices if listed else [next_body_vertices])]
@@ -289,14 +315,14 @@ class Simulator:
     @torch.inference_mode()
     def _begin(
         self,
-        garments: list[Garment],
+        brought: Brought,
         single: bool,
         bodies: PackedBodies,
-        known: torch.Tensor,
         body_frames: list[torch.Tensor],
         face_splits: int,
     ) -> list[SimulationState[Any, Any]]:
-        """States of the known frames [K,V,3]: one for a cold start, H with a history."""
+        """States of the known frames: one for a cold start, H with a history."""
+        garments, known = brought.simulated, torch.from_numpy(brought.known).to(self.device)
         scene = Scene(
             garments,
             bodies,
@@ -310,6 +336,7 @@ class Simulator:
             timings=self.timings,
             contact_sources=self.contact_sources,
             correctors=self.correctors,
+            brought=brought,
         )
         history_length = self.network.config.history
         features = scene.features(known[0], body_frames[0], body_frames[0])
@@ -339,14 +366,13 @@ class Simulator:
             after = state.graph(state.now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
 
-    def _known(self, garments: list[Garment], single: bool, first: Any, history: Any) -> torch.Tensor:
-        frames = known_frames(garments, single, first, history, self.network.config.history)
-        return torch.from_numpy(frames).to(self.device)
+    def _brought(self, garments: list[Garment], single: bool, first: Any, history: Any) -> Brought:
+        return Brought(garments, known_frames(garments, single, first, history, self.network.config.history))
 
     def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
-        """Arrays [*,3] end to end on the device; always a copy, so that callers may reuse theirs.
+        """Concatenates arrays [*,3] on the device; always a copy, so that callers may reuse their arrays.
 
-        Pinned on the way to a GPU: from other memory the host would wait until all earlier work is done.
+        Copies to a GPU start from pinned memory; with other memory the host would wait for all earlier work.
         """
         packed = torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False))
         return packed.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else packed

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from .frame import Frame
 from .graph import GraphedFrames
-from .recording import Outcome, read
+from .results.recording import Outcome, read, seen
 from .scene import Scene
 
 Vertices = TypeVar("Vertices")
@@ -19,19 +19,19 @@ Status = TypeVar("Status")
 class SimulationState(Generic[Vertices, Status]):
     """Garments and bodies at one frame, with the history the network needs. `Simulator.step` returns a new one.
 
-    States are values: stepping one leaves it as it was, so a state may be kept, and stepped twice with different
-    bodies. The bodies' search trees are shared by all states of a `start` and moved as needed, so states of one `start`
-    must not be stepped from several threads at a time.
+    States are values: `step` does not change its argument, so a state may be kept, and stepped twice with different
+    bodies. All states of a `start` share the search trees of the bodies, so they must not be stepped from several
+    threads at a time.
 
-    Stepping does not wait for a GPU; looking at `vertices` or `status` does.
+    `step` does not wait for a GPU; reading `vertices` or `status` does.
 
-    Of one garment it is a `SimulationState[np.ndarray, RolloutStatus]`, of a list of garments a
+    For one garment the type is `SimulationState[np.ndarray, RolloutStatus]`, for a list of garments
     `SimulationState[list[np.ndarray], list[RolloutStatus]]`.
     """
 
     scene: Scene
-    single: bool  # one garment, not a list
-    frame: int
+    single: bool  # whether one garment was given instead of a list
+    frame: int  # number of the frame, from 0
     now: Frame
     graph: GraphedFrames | None = None  # replays frames, for all states of a `start`
 
@@ -49,4 +49,4 @@ class SimulationState(Generic[Vertices, Status]):
 
     @cached_property
     def _read(self) -> Outcome:
-        return read(self.scene, self.frame, [self.now.outcome])[0]
+        return read(self.scene, self.frame, [seen(self.scene, self.now)])[0]

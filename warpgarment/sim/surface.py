@@ -1,7 +1,7 @@
-"""The surface of garments between their vertices, where the body must not come through.
+"""Depth of garments in the body between their vertices, and the distance of vertices that removes it.
 
 Collision refinement moves vertices. Between vertices that are all outside, a round or a pointed body can still come
-through an edge or a face, and an onlooker sees it. There, the corners are made to keep a larger distance.
+visibly through an edge or a face. The corners of such edges and faces must keep a larger distance.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ AMPLE = 1.5  # corners are moved by this multiple of the depth between them, sin
 
 
 class Surface:
-    """Edges and faces of a batch.
+    """Edges and faces of a batch, of which the depth is measured.
 
     Args:
-        garments: In the order of the batch.
-        packed: The same, packed.
+        garments: The garments, in the order of the batch.
+        packed: The same garments, packed.
     """
 
     def __init__(self, garments: Sequence[Garment], packed: PackedGarments) -> None:
@@ -35,7 +35,7 @@ class Surface:
         self._packed = packed
 
     def depth(self, vertices: torch.Tensor, bodies: BodyMeshes, body_of_vertex: torch.Tensor) -> SurfaceDepth:
-        """How deep vertices [V,3], edges and faces are in the bodies."""
+        """Depth of vertices [V,3], edges and faces in the bodies [m], see `SurfaceDepth`."""
         packed = self._packed
         return surface_depth(
             vertices, bodies, body_of_vertex, self._edges, packed.faces, packed.garment_of_vertex, packed.count
@@ -49,19 +49,19 @@ def distance_to_keep(
     bodies: BodyMeshes,
     body_of_vertex: torch.Tensor,
 ) -> torch.Tensor:
-    """Distances from the body at which nothing of it comes through edges and faces.
+    """Distances that vertices must keep, so that the body does not come through edges and faces.
 
     Args:
         epsilon: Distance that each vertex is to keep now [m], float32 [V].
-        missing: How much deeper edges and faces are than their corners, see `SurfaceDepth` [m], float32 [V].
-        vertices: Positions that this is said of [m], float32 [V,3].
+        missing: Depth of edges and faces beyond that of their corners, see `SurfaceDepth` [m], float32 [V].
+        vertices: Positions at which `missing` was measured [m], float32 [V,3].
         bodies: The bodies in the same frame.
         body_of_vertex: Body of each vertex, int32 [V].
 
     Returns:
-        Float32 [V]: `epsilon`; or if that is more, where something is missing, the vertex's distance from the body now
-        and `AMPLE` times what is missing.
+        Distances [m], float32 [V]: `epsilon`; where `missing` is positive, the vertex's distance from the body now plus
+        `AMPLE` times `missing`, if that is more.
     """
     body = torch.where(missing > 0, body_of_vertex, -1)
     wanted = bodies.query(vertices.detach(), body).distance + AMPLE * missing
-    return torch.where(wanted > epsilon, wanted, epsilon)  # NaN where nothing was asked
+    return torch.where(wanted > epsilon, wanted, epsilon)  # the query gives NaN for body -1

@@ -1,4 +1,4 @@
-"""Where the time of a frame goes."""
+"""Measures the time of the stages of a frame."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 
 
 class Timings(dict[str, float]):
-    """Seconds per stage, added up; call it with a stage's name around the stage.
+    """Total seconds of each stage; a call with the name of a stage is a context manager that measures a block.
 
-    On CUDA a stage returns before the device is done with it. Its time is measured only while `synchronise` is set, and
-    waiting makes the whole slower; the CPU is always measured.
+    On CUDA, a stage returns before the device has finished it. So its time is measured only while `synchronise` is set,
+    which makes frames slower, since the host waits after every stage. On a CPU, times are always measured.
     """
 
     def __init__(self, device: torch.device) -> None:

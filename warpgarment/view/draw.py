@@ -14,17 +14,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpgarment.objects.motion import GarmentMotion
+
 from .images import caption, titled, write_mp4, write_png
+from .matched import Motion, in_step, matched
 
 if TYPE_CHECKING:
     import warp as wp
 
     from warpgarment.objects.body import BodyMotion
-    from warpgarment.objects.motion import GarmentMotion
 
 __all__ = [
     "Camera",
@@ -45,7 +47,6 @@ SKIN, CORAL, TEAL, OCHRE, PLUM, SLATE = "#cfc4bb", "#e0614f", "#2a9aa6", "#e3a23
 PALETTE = (CORAL, TEAL, OCHRE, PLUM)  # garments, in the order given
 
 Color = str | tuple[float, float, float]
-Motion: TypeAlias = "BodyMotion | GarmentMotion"
 
 
 @dataclass(frozen=True)
@@ -214,11 +215,14 @@ def _vec3(values: Iterable[float]) -> wp.vec3:
 def chase(motions: Sequence[Motion], *, size: tuple[int, int], azimuth: float = 28.0) -> Camera:
     """A camera that keeps all motions in the picture while it follows the first; `target` is relative to the first.
 
+    Motions of other rates or starts are matched by time, as in `film`.
+
     Args:
         motions: Motions to show; the first one is followed.
         size: Width and height of the picture in pixels.
         azimuth: Direction of the camera around the vertical axis [degrees].
     """
+    motions = _in_step(motions)
     frames = range(0, motions[0].frames, max(1, motions[0].frames // 12))
     middle = _middle(motions[0])
     around = np.concatenate([m.vertices[min(t, m.frames - 1)] - middle[t] for m in motions for t in frames])
@@ -238,6 +242,8 @@ def film(
 ) -> Iterator[np.ndarray]:
     """Pictures of a motion, one after another; the camera follows the body, or the first garment if there is no body.
 
+    Motions of other rates or starts are matched by time: the frames are those of the first garment that all have.
+
     Args:
         body: Body to draw; None for none.
         garments: Garments to draw.
@@ -251,7 +257,8 @@ def film(
     Yields:
         sRGB picture of each frame, uint8 [height, width, 3].
     """
-    motions: list[Motion] = [*([body] if body is not None else []), *garments]
+    motions = _in_step([*([body] if body is not None else []), *garments])
+    body, garments = _parted(body, motions)
     camera = camera or chase(motions, size=size)
     middle = _middle(motions[0])
     floor = float(np.percentile(motions[0].vertices[..., 1].min(1), 5)) if body is not None else None
@@ -290,6 +297,8 @@ def sheet(
 ) -> np.ndarray:
     """Writes a PNG with one row of evenly spaced frames for each of `rows`, all drawn with the same camera.
 
+    Motions of other rates or starts are matched by time, as in `film`; each picture says its time.
+
     Args:
         path: File to write.
         body: Body to draw in every row; None for none.
@@ -302,13 +311,17 @@ def sheet(
     Returns:
         sRGB picture, uint8 [H, W, 3].
     """
-    timed: Motion = body if body is not None else rows[0][1][0]
+    motions = _in_step([*([body] if body is not None else []), *(g for _, garments, _ in rows for g in garments)])
+    body, worn = _parted(body, motions)
+    left = iter(worn)
+    rows = [(text, [next(left) for _ in garments], colors) for text, garments, colors in rows]
+    timed = motions[0]
     moments = np.unique(np.linspace(0, timed.frames - 1, frames).round().astype(int))
-    camera = camera or chase([timed, *(g for _, garments, _ in rows for g in garments)], size=size)
+    camera = camera or chase(motions if body is not None else [timed, *motions], size=size)
     strips = []
     for text, garments, colors in rows:
         panels = film(body, garments, size=size, colors=colors, frames=moments, camera=camera, device=device)
-        strip = [caption(p, f"{t / timed.fps:.1f} s") for p, t in zip(panels, moments, strict=True)]
+        strip = [caption(p, f"{timed.start + t / timed.fps:.1f} s") for p, t in zip(panels, moments, strict=True)]
         strips.append(titled(np.concatenate(strip, axis=1), text))
     picture = np.concatenate(strips, axis=0)
     write_png(path, picture)
@@ -348,6 +361,21 @@ def contact_sheet(
             rows.append((f"{name}physics (ground truth)", [reference], [SLATE]))
     camera = chase([body, *(r if r is not None else g for g, r in zip(garments, references, strict=True))], size=size)
     return sheet(path, body, rows, frames=frames, size=size, camera=camera, device=device)
+
+
+def _in_step(motions: Sequence[Motion]) -> list[Motion]:
+    """The motions as they are, if their frames are at the same moments, else at the frames of the first garment."""
+    if in_step(motions):
+        return list(motions)
+    names = [getattr(motion, "name", "the body") or "a garment" for motion in motions]
+    return matched(motions, names, by=next((k for k, m in enumerate(motions) if isinstance(m, GarmentMotion)), 0))
+
+
+def _parted(body: BodyMotion | None, motions: Sequence[Motion]) -> tuple[BodyMotion | None, list[GarmentMotion]]:
+    """A list that begins with the body, if there is one, as body and garments."""
+    first: Any = motions[0] if body is not None else None
+    rest: Any = list(motions[1:] if body is not None else motions)
+    return first, rest
 
 
 def _middle(motion: Motion, width: int = 9) -> np.ndarray:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import tracemalloc
 
 import pytest
 
 from warpgarment.errors import MeshError
-from warpgarment.io.disk.plain import JSON_DEEPEST, JSON_LARGEST, below, open_plain, read_json
+from warpgarment.io.disk.plain import JSON_DEEPEST, JSON_LARGEST, below, open_plain, read_json, read_plain
 
 
 def test_not_plain(tmp_path):
@@ -29,6 +30,20 @@ def test_large_json_is_not_read(tmp_path):
         file.truncate(3 << 30)
     with pytest.raises(MeshError, match=f"3,221,225,472 bytes.* {JSON_LARGEST:,} at most"):
         read_json(tmp_path / "a.json")
+
+
+def test_a_hole_is_no_text(tmp_path):
+    """A sparse file under the name of a text would be read into gigabytes of zeros; they are found in the first."""
+    with open(tmp_path / "a.obj", "wb") as file:
+        file.write(b"v 0 0 0\n")
+        file.truncate(2 << 30)
+    tracemalloc.start()
+    with pytest.raises(MeshError, match=r"a\.obj: binary data"):
+        read_plain(tmp_path / "a.obj", text=True)
+    assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    tracemalloc.stop()
+    with pytest.raises(MeshError, match="2,147,483,648 bytes"):
+        read_plain(tmp_path / "a.obj", 1 << 20)
 
 
 @pytest.mark.parametrize("depth", [JSON_DEEPEST + 1, 900, 200_000])

@@ -101,20 +101,40 @@ def test_several_objects_stay_several_and_are_read_back(tmp_path):
         wg.BodyMotion.load(tmp_path / "frames")
 
 
-def test_cleaning_leads_corners_to_the_vertices_that_stay(tmp_path):
-    """After vertices were joined, polygons would name vertices that are no more."""
-    doubled = [
-        "v {} {} {}".format(*VERTICES[0]),
-        "v 9 9 9",
-        f"f {len(VERTICES) + 1}/1 2/2 14/3",
-        f"f 1/1 2/2 {len(VERTICES) + 1}/3",
-    ]
-    garment = load(tmp_path, "\n".join(doubled), clean=True)
-    assert len(garment.vertices) == len(VERTICES)  # the double is joined, the vertex without a face gone
+def panels(folder):
+    """The skirt as two panels: the vertices of one column are there twice, the polygons behind it name the doubles."""
+    path = dressed.write_obj(folder / "skirt.obj")
+    doubled = [row * dressed.AROUND for row in range(dressed.RINGS)]
+    number = {v: len(VERTICES) + k for k, v in enumerate(doubled)}
+    rows, at = [], 0
+    for line in path.read_text().splitlines():
+        if line.startswith("f "):
+            polygon, at = POLYGONS[at], at + 1
+            last = {v for v, t in zip(polygon.vertices, polygon.coordinates, strict=True) if t % 13 == 12}
+            words = [(number[v] if v in last else v, t) for v, t in
+                     zip(polygon.vertices, polygon.coordinates, strict=True)]  # fmt: skip
+            line = "f " + " ".join(f"{v + 1}/{t + 1}" for v, t in words)
+        rows.append(line)
+    first = next(k for k, row in enumerate(rows) if row.startswith("vt "))
+    rows[first:first] = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in VERTICES[doubled].tolist()]
+    path.write_text("\n".join(rows))
+    return path
+
+
+def test_seams_that_are_joined_leave_the_polygons_of_the_file(tmp_path):
+    """Panels that are simulated as one would come back with polygons that name other vertices than the file's."""
+    with pytest.warns(UserWarning, match="joined"):
+        garment = wg.Garment.load(panels(tmp_path), clean=True)
+    assert len(garment.vertices) == len(VERTICES) + dressed.RINGS
+    assert len(garment.simulated.garment.vertices) == len(VERTICES)
     garment.save(tmp_path / "a.obj")
-    found = dressed.read_obj(tmp_path / "a.obj")[0]
-    assert close(found[:-1], expected(VERTICES))
-    assert len(found[-1][0]) == 3  # the triangle at the double; the last, which has two corners left, is gone
+    assert close(dressed.read_obj(tmp_path / "a.obj")[0], expected(VERTICES))
+    with pytest.warns(UserWarning, match="joined"):
+        joined = garment.cleaned()
+    assert len(joined.vertices) == len(VERTICES)
+    joined.save(tmp_path / "b.obj")
+    assert close(dressed.read_obj(tmp_path / "b.obj")[0], expected(VERTICES))
+    np.testing.assert_array_equal(np.sort(joined.surface.corners), np.sort(CORNERS))
 
 
 def test_renumbering_drops_what_is_left_of_polygons():

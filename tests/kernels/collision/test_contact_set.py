@@ -33,11 +33,12 @@ def solver_for(rest: meshes.Mesh) -> CollisionSolver:
 @pytest.mark.parametrize("remembers", [False, True])
 @pytest.mark.parametrize("each", [False, True])
 def test_body_contacts_are_those_of_a_twin(each, remembers):
-    """A wrong face, side, body, distance or vertex. Two bodies of overlapping limbs and a third of the vertices on
-    none; a distance for all or for each vertex; with and without the way that they came.
+    """A contact would have a wrong face, side, body, distance or vertex.
 
-    1e-6 m of gap: positions are float32. Normals within 1e-5; they are not compared within 0.1 mm of the surface,
-    where float32 corners turn them, nor is the choice of who is in contact within 1e-6 m of the distance to keep.
+    Two bodies of overlapping limbs and a third of the vertices on none; a distance for all or for each vertex; with and
+    without the way that they came. 1e-6 m of gap: positions are float32. Normals within 1e-5; they are not compared
+    within 0.1 mm of the surface, where float32 corners turn them, nor is the choice of who is in contact within 1e-6 m
+    of the distance to keep.
     """
     rng, one = np.random.default_rng(0), meshes.posed_body()
     other = meshes.Mesh(one.vertices + np.float32([0.1, 0.0, 0.05]), one.faces)
@@ -61,7 +62,7 @@ def test_body_contacts_are_those_of_a_twin(each, remembers):
     touching, clear = (normal != 0).any(1), np.abs(distance - epsilon) > 1e-6
     assert np.array_equal((mine != 0).any(1)[clear], touching[clear])
     assert 30 < touching.sum() < 100
-    kept = found.distance.numpy() if each else found.distance
+    kept = found.distance.numpy()
     missing = kept - (mine * (end - found.anchor.numpy())).sum(1)
     compared = touching & clear & (np.abs(distance) > 1e-4)
     np.testing.assert_allclose(mine[compared], normal[compared], atol=1e-5)
@@ -73,7 +74,7 @@ def test_body_contacts_are_those_of_a_twin(each, remembers):
 
 
 def test_refinement_is_finding_and_solving():
-    """`refine` and a source with `solve` would be two ways that drift apart. Exact, with a number and a tensor."""
+    """`refine` and `solve` with a source would give different results. Exact, with a number and a tensor."""
     rest, bodies = meshes.skirt(24, 8, waist=0.17), bodies_of(meshes.icosphere(3, 0.3, (0.05, 0.8, 0.0)))
     vertices, solver = torch.tensor(rest.vertices), solver_for(rest)
     for epsilon in (EPSILON, torch.linspace(0.001, 0.02, len(vertices))):
@@ -113,7 +114,7 @@ def test_contacts_with_a_plane_have_the_minimiser_of_a_twin(each):
 
 
 def test_of_several_sources_the_largest_gap_counts():
-    """A vertex that is in a body and below a floor would be pushed out of the one that is nearly left.
+    """A vertex in a body and below a floor would be pushed out of the one in which it is less deep.
 
     Against a loop over vertices. A source without contacts, numbers and tensors as distances, gaps of both signs.
     """

@@ -36,7 +36,7 @@ def poisoned(monkeypatch):
 
 
 def ellipsoid(x: float = 0.05) -> meshes.Mesh:
-    """A torso that the skirts stick in by up to some 30 mm on one side.
+    """A torso into which the skirts reach by up to some 30 mm on one side.
 
     It shares no plane of symmetry with them: where two faces are equally close, either is right, and results differ.
     """
@@ -53,7 +53,7 @@ def solver_for(rest: meshes.Mesh, **options) -> collision.CollisionSolver:
 
 
 def moved(rest: meshes.Mesh) -> np.ndarray:
-    """A garment in motion: its shape is not that of the rest mesh of the Laplacian."""
+    """A deformed garment, whose shape is not that of the rest mesh of the Laplacian."""
     v = rest.vertices.astype(np.float64)
     return (v + 0.01 * np.sin(15.0 * v[:, [1, 2, 0]])).astype(np.float32)
 
@@ -70,7 +70,7 @@ def moved(rest: meshes.Mesh) -> np.ndarray:
     ids=["coarse", "2k faces", "sheet", "mostly inside"],
 )
 def test_result_is_the_minimiser(rest, solver):
-    """A wrong system, contact or stop. 0.02 mm is promised; detection in float32 accounts for 0.001 mm."""
+    """The result would not be the minimiser. 0.02 mm, as documented; contacts in float32 account for 0.001 mm."""
     vertices, body = moved(rest), ellipsoid()
     if np.ptp(rest.vertices[:, 2]) == 0:
         vertices = (vertices + np.array([-0.243, 0.55, 0.18])).astype(
@@ -87,7 +87,7 @@ def test_result_is_the_minimiser(rest, solver):
 
 @pytest.mark.parametrize("weights", [(0.5, 1e-3), (2.0, 1e-2), (0.0, 0.1)])
 def test_weights_and_epsilon_reach_the_energy(weights):
-    """λ_lap, λ_reg or ε mixed up or ignored."""
+    """λ_lap, λ_reg or ε would be confused or ignored."""
     rest, body = meshes.skirt(24, 8, waist=0.17), ellipsoid()
     contacts = reference.contacts(rest.vertices, body.vertices, body.faces, 0.01)
     exact = reference.refine(rest.vertices, rest.vertices, rest.faces, *contacts, 0.01, *weights)
@@ -118,7 +118,7 @@ def test_a_distance_for_each_vertex(solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_nothing_moves_without_contact(solver):
-    """A garment that is clear of the body, and of another garment that isn't, comes back to the last bit."""
+    """A garment without contacts would move, perhaps with another garment that has contacts. Bit for bit."""
     far = meshes.Mesh(meshes.skirt(24, 8).vertices + np.float32([3.0, 0.0, 0.0]), meshes.skirt(24, 8).faces)
     near = meshes.skirt(24, 8, waist=0.17)
     both = solver_for(meshes.joined(far, near), **SOLVERS[solver])
@@ -134,7 +134,7 @@ def test_nothing_moves_without_contact(solver):
 
 @pytest.mark.parametrize("one_core", [True, False])
 def test_packed_batch_is_the_garments_one_by_one(one_core):
-    """Garments of a batch that reach into each other, equal ones that share an inverse, or the wrong body.
+    """Garments of a batch would influence each other, even equal ones that share an inverse, or meet the wrong body.
 
     The middle one is too large for an inverse. The same to 1e-6 m: sums may run in another order.
     """
@@ -158,12 +158,12 @@ def test_packed_batch_is_the_garments_one_by_one(one_core):
 
 
 def inverted(solver: collision.CollisionSolver) -> list[int]:
-    """Where the inverse of each component begins; -1 without one."""
+    """First entry of the inverse of each component; -1 without one."""
     return unpack(solver._model, Model).dense.base.tolist()
 
 
 def test_budgets_are_kept():
-    """A batch that allocates without a limit. Only the first of two different skirts fits; the result is the same."""
+    """A batch would allocate without a limit. Only the first of two different skirts fits; the result is the same."""
     first, second = meshes.skirt(24, 8, waist=0.17), meshes.skirt(22, 8, waist=0.16)
     both, count = meshes.joined(first, second), len(first.vertices)
     entries = count * (-(-count // 16) * 16)
@@ -177,7 +177,7 @@ def test_budgets_are_kept():
 
 
 def test_passes_repeat_detection_and_solve():
-    """`passes` that solve the same contacts again, or start from the first input. Two calls are the same."""
+    """Each pass would solve the first contacts again, or start from the input. Against two calls."""
     rest, bodies = meshes.skirt(24, 8, waist=0.17), body_of(ellipsoid())
     solver = solver_for(rest)
     first = solver.refine(torch.tensor(rest.vertices), bodies)
@@ -191,7 +191,7 @@ def test_passes_repeat_detection_and_solve():
 
 
 def test_normals_at_the_surface_are_those_of_the_faces():
-    """A vertex on the body that is pushed along rounding noise, or inwards; a vertex inside that is pulled deeper.
+    """A vertex on the body would be pushed in a random direction or inwards, or a vertex inside would be pulled deeper.
 
     A tetrahedron's face as the body: points on it, 2 mm outside and 2 mm inside all have its normal.
     """
@@ -203,14 +203,15 @@ def test_normals_at_the_surface_are_those_of_the_faces():
     points = torch.tensor(corners.mean(0) + offsets[:, None] * normal, dtype=torch.float32)
     bodies = body_of(body)
     query = bodies.query(points)
-    closest, normals = (a.numpy() for a in collision.contacts(points, query.distance, query.face, bodies, EPSILON))
+    normals, closest, *_ = collision.contacts(points, query.distance, query.face, bodies, EPSILON)
+    normals, closest = normals.numpy(), closest.numpy()
     np.testing.assert_allclose(normals[:5], np.tile(normal, (5, 1)), atol=1e-6)  # that of the face's float32 corners
     np.testing.assert_allclose(closest[:5], query.closest[:5], atol=1e-7)
     assert not normals[5].any()
 
 
 def test_single_mesh_spelling_is_the_same():
-    """`refine` with other defaults than the solver's, or `rest_vertices` that are ignored."""
+    """The function `refine` would have other defaults than the solver, or ignore `rest_vertices`."""
     rest, body = meshes.skirt(24, 8, waist=0.17), ellipsoid()
     vertices, faces = torch.tensor(moved(rest)), torch.tensor(rest.faces)
     arguments = (vertices, faces, torch.tensor(body.vertices), torch.tensor(body.faces))
@@ -224,7 +225,7 @@ def test_single_mesh_spelling_is_the_same():
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_gradient_is_that_of_a_dense_solve(solver):
-    """A wrong adjoint. The float64 twin is linear in the vertices for fixed contacts: I - A⁻¹ N Nᵀ, formed densely.
+    """The adjoint would be wrong. The float64 twin is the dense matrix I - A⁻¹ N Nᵀ, for fixed contacts.
 
     1e-5 of the largest entry; the adjoint is solved to 1e-6.
     """
@@ -246,11 +247,11 @@ def test_gradient_is_that_of_a_dense_solve(solver):
 
 
 def test_operator_passes_opcheck():
-    """An operator that torch.compile would break on: schema, fake tensors, autograd registration."""
+    """torch.compile would fail on the operator: schema, fake tensors, autograd registration."""
     rest, bodies = meshes.skirt(8, 3, waist=0.17), body_of(ellipsoid())
     vertices = torch.tensor(rest.vertices, requires_grad=True)
     query = bodies.query(vertices)
-    closest, normals = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
+    normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
     limit = torch.full((1,), 1e-6, dtype=torch.float64)
     arguments = (vertices, normals, closest, EPSILON, limit, solver_for(rest)._model, 100)
     torch.library.opcheck(torch.ops.warpgarment.collision_solve, arguments)
@@ -258,11 +259,11 @@ def test_operator_passes_opcheck():
 
 @pytest.mark.parametrize("solver", ["lanes", "displacements"])
 def test_many_lanes_give_the_same_result(monkeypatch, solver):
-    """A missing barrier or a wrong stride, which one lane can't show. 256 lanes a block, as on a GPU."""
+    """A barrier would be missing or a stride wrong, which one lane cannot show. 256 lanes per block, as on a GPU."""
     rest, bodies = meshes.skirt(12, 4, waist=0.17), body_of(ellipsoid())
     solver, vertices = solver_for(rest, **SOLVERS[solver]), torch.tensor(rest.vertices, requires_grad=True)
     query = bodies.query(vertices)
-    closest, normals = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
+    normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
     limit = torch.full((1,), 1e-6, dtype=torch.float64)
 
     def solve():
@@ -278,7 +279,7 @@ def test_many_lanes_give_the_same_result(monkeypatch, solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_reaching_the_limit_is_said_once(solver):
-    """An iteration that ends unconverged without a word, or one that warns every frame."""
+    """An iteration would stop unconverged without a warning, or warn in every frame."""
     rest, bodies = meshes.skirt(24, 8, waist=0.17), body_of(ellipsoid())
     solver = solver_for(rest, max_iterations=3, **SOLVERS[solver])
     with pytest.warns(RuntimeWarning, match="raise max_iterations"):
@@ -290,7 +291,7 @@ def test_reaching_the_limit_is_said_once(solver):
 
 
 def test_not_a_number_stays_visible():
-    """NaN in, and a result that looks like numbers where there were none."""
+    """NaN in the input would become finite numbers in the result."""
     rest = meshes.skirt(24, 8, waist=0.17)
     vertices = torch.tensor(rest.vertices)
     vertices[7, 1] = torch.nan
@@ -323,7 +324,7 @@ def test_not_a_number_stays_visible():
     ],
 )
 def test_bad_arguments_are_refused(change, error, message):
-    """A kernel that reads outside of its arrays, or an option that makes no sense."""
+    """A kernel would read outside of its arrays, or an invalid option would be accepted."""
     rest = meshes.tetrahedron()
     arguments = {"vertices": torch.tensor(rest.vertices), **change}
     with pytest.raises(error, match=message):
@@ -339,11 +340,11 @@ def test_bad_arguments_are_refused(change, error, message):
     ],
 )
 def test_bad_options_are_refused(options, message):
-    """A singular or indefinite system that the iteration would wander in."""
+    """The system would be singular or indefinite, and the iteration would not converge."""
     with pytest.raises(ValueError, match=message):
         solver_for(meshes.tetrahedron(), **options)
 
 
 def test_largest_compliance_covers_the_benchmarked_garments():
-    """A limit lowered so far that a garment of 2,000 faces (1,000 vertices) falls to the slow way."""
+    """The limit would be so low that a garment of 2,000 faces (1,000 vertices) is solved by the slow method."""
     assert compliance.LARGEST >= 1100

@@ -187,7 +187,7 @@ def test_rotation_is_the_polar_factor():
 
 
 def gradients_of_replacement(phi: torch.Tensor, values: np.ndarray, weight: np.ndarray):
-    """Ours, in phi and in the values."""
+    """Gradients of the replacement by the kernel, in phi and in the values."""
     phi = phi.clone().requires_grad_()
     s = torch.tensor(values, dtype=torch.float32, requires_grad=True)
     (deformation.replace_singular_values(phi, s) * torch.tensor(weight, dtype=torch.float32)).sum().backward()

@@ -71,7 +71,7 @@ def test_decomposition_of_nothing_and_of_nan():
 
 
 class Prediction:
-    """What the network might say of 60 faces of three garments, four components."""
+    """A random prediction for 60 faces of three garments with four components."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(1)
@@ -85,7 +85,7 @@ class Prediction:
         self.component = torch.minimum(torch.arange(60, dtype=torch.int32) // 15, torch.tensor(3, dtype=torch.int32))
 
     def next(self, **options):
-        """Ours."""
+        """Gradients of the next frame by the kernel."""
         arguments = (self.features, self.psi, self.values, self.velocity, self.component, self.garment, 3)
         return next_gradients(*arguments, **options)
 

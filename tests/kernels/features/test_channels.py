@@ -53,7 +53,7 @@ class Scene:
 
 @pytest.fixture(scope="module")
 def plain() -> Scene:
-    """As it is."""
+    """The scene without any change."""
     return Scene()
 
 

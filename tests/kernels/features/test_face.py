@@ -38,17 +38,17 @@ class Scene:
         self.garment_mean = deformation.segment_mean(self.centroids, self.garment_of_face, 2)
 
     def interaction(self) -> features.BodyInteraction:
-        """With the body at t and t+1."""
+        """The interaction with the body at t and t+1."""
         return features.body_interaction(self.centroids, None, self.bodies, torch.tensor(self.next_body.vertices))
 
     def features(self, vertices, garment_mean, interaction):
-        """Ours."""
+        """Features by the kernel."""
         return features.face_features(
             self.inverse_rest, vertices, self.faces, self.garment_of_face, garment_mean, interaction
         )
 
     def twin(self, vertices, garment_mean, interaction):
-        """Theirs."""
+        """Features by the float64 twin."""
         i = features.BodyInteraction(*(t.numpy() for t in interaction))
         arguments = (self.rest.numpy(), vertices, self.faces.numpy(), self.garment_of_face.numpy(), garment_mean)
         return reference.face_features(*arguments, i.closest, i.sign, i.deformation, i.velocity)

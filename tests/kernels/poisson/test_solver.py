@@ -36,7 +36,7 @@ def poisoned(monkeypatch):
 
 
 def problem(name: str, scale: float = 1.0, noise: float = 0.05):
-    """Rest mesh, deformed vertices, and gradients that no vertices have exactly (smooth ones plus noise)."""
+    """Rest mesh, deformed vertices, and gradients that are not those of any vertices (smooth ones plus noise)."""
     rest = GARMENTS[name].scaled(scale)
     goal = meshes.moved(rest).vertices.astype(np.float64)
     corners = (rest.vertices[rest.faces], goal[rest.faces])
@@ -68,7 +68,7 @@ def smallest_diagonal(rest: meshes.Mesh) -> float:
 
 @pytest.mark.parametrize("name", GARMENTS)
 def test_laplacian_is_libigls_with_the_sign_flipped(name):
-    """A wrong weight, angle or sign. Agreement to rounding, of the largest weight."""
+    """A weight, angle or sign would be wrong. To rounding of the largest weight."""
     rest = GARMENTS[name]
     ours = laplacian.cotangent_laplacian(rest.vertices, rest.faces).toarray()
     theirs = -igl.cotmatrix(rest.vertices.astype(np.float64), rest.faces.astype(np.int64)).toarray()
@@ -78,7 +78,10 @@ def test_laplacian_is_libigls_with_the_sign_flipped(name):
 
 
 def test_components_are_ordered_by_lowest_vertex():
-    """`mean` rows that go to the wrong garment. Faces in reverse order, vertex 0 and the last one without a face."""
+    """Rows of `mean` would belong to the wrong garment.
+
+    Faces in reverse order; vertex 0 and the last one without a face.
+    """
     faces = np.array([[7, 8, 9], [5, 2, 1], [3, 4, 6]], np.int32)
     vertex, face, count = laplacian.components(11, faces)
     assert vertex.tolist() == [0, 1, 1, 2, 2, 1, 2, 3, 3, 3, 4]
@@ -90,7 +93,7 @@ def test_components_are_ordered_by_lowest_vertex():
 @pytest.mark.parametrize("scale", meshes.SCALES)
 @pytest.mark.parametrize("name", GARMENTS)
 def test_solution_is_the_direct_one(name, scale, way):
-    """A wrong right-hand side or factor, or a solver that stops early or stagnates.
+    """The right-hand side or factor would be wrong, or the solver would stop early or stagnate.
 
     1e-5 of the bounding box is promised (of the smallest component's here); float32 output accounts for 2e-7 of it.
     """
@@ -113,14 +116,14 @@ def test_solution_is_the_direct_one(name, scale, way):
 
 @pytest.mark.parametrize("name", GARMENTS)
 def test_gradients_of_a_garment_give_it_back(name):
-    """Faces or axes mixed up in a way that the reference shares. 1e-5 of the bounding box, as promised."""
+    """Faces or axes would be confused in the same way as in the reference. 1e-5 of the bounding box, as documented."""
     rest, goal, phi, mean = problem(name, noise=0.0)
     result = solver_for(rest).solve(torch.tensor(phi), torch.tensor(mean)).numpy()
     assert np.abs(result - goal).max() < 1e-5 * diagonal(rest)
 
 
 def test_mean_of_face_centroids_is_set():
-    """A mean over vertices instead of faces, or garments moved by each other's. Float32 rounds positions near 3 m."""
+    """The mean would be over vertices, or that of another garment. The tolerance is float32 rounding near 3 m."""
     rest, _, phi, mean = problem("two_components")
     mean = mean + np.float32([[1.0, 2.0, 3.0], [-3.0, 0.5, 0.0]])
     result = solver_for(rest).solve(torch.tensor(phi), torch.tensor(mean)).numpy().astype(np.float64)
@@ -131,7 +134,7 @@ def test_mean_of_face_centroids_is_set():
 
 @pytest.mark.parametrize("way", SOLVERS)
 def test_vertices_without_faces_stay(way):
-    """An empty row of the matrix that makes NaN, or moves with a mean that isn't its own."""
+    """A vertex without faces would become NaN, or move with the mean of another component."""
     rest, _, phi, mean = problem("skirt")
     loose = meshes.Mesh(np.concatenate([[[9, 9, 9]], rest.vertices, [[7, 8, 9]]]).astype(np.float32), rest.faces + 1)
     solver = solver_for(loose, **SOLVERS[way])
@@ -145,7 +148,7 @@ def test_vertices_without_faces_stay(way):
 
 
 def test_no_faces_and_no_vertices():
-    """A launch of nothing that fails instead of returning what it was given."""
+    """An empty launch would fail instead of returning its input."""
     empty = PoissonSolver(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
     assert empty.solve(torch.zeros(0, 3, 3), torch.zeros(0, 3)).shape == (0, 3)
     points = PoissonSolver(torch.ones(2, 3), torch.zeros(0, 3, dtype=torch.int32))
@@ -156,9 +159,9 @@ def test_no_faces_and_no_vertices():
 @pytest.mark.parametrize("way", SOLVERS)
 @pytest.mark.parametrize("scale", meshes.SCALES)
 def test_pins_are_soft_constraints(scale, way):
-    """Pins with another stiffness than documented, or a component that follows both its pins and its mean.
+    """Pins would have another stiffness than documented, or a component would follow both its pins and its mean.
 
-    The skirt is pinned at its waist, at targets it can't reach; the sheet is free. 1e-5 of the bounding box.
+    The skirt is pinned at its waist, at targets that it cannot reach; the sheet is free. 1e-5 of the bounding box.
     """
     rest, goal, phi, mean = problem("two_components", scale)
     pins = np.array([3, 0, 7, 8])
@@ -172,7 +175,7 @@ def test_pins_are_soft_constraints(scale, way):
 
 @pytest.mark.parametrize("way", SOLVERS)
 def test_packed_batch_is_the_garments_one_by_one(way):
-    """Garments of a batch that reach into each other. Same arithmetic, so equal to the last bit."""
+    """Garments of a batch would influence each other. Same arithmetic, so equal to the last bit."""
     names = ["skirt", "tetrahedron", "irregular_grid", "tetrahedron"]
     rests, _, phis, means = zip(*(problem(name) for name in names), strict=True)
     alone = [
@@ -186,7 +189,7 @@ def test_packed_batch_is_the_garments_one_by_one(way):
 
 
 def test_a_good_guess_saves_iterations():
-    """A solve for the vertices themselves, which stagnates, instead of for the increment."""
+    """The solve would be for the vertices, which stagnates, instead of for the increment."""
     rest, _, phi, mean = problem("fine")
     solver = solver_for(rest, factor_budget=0)
     first = solver.solve(torch.tensor(phi), torch.tensor(mean))
@@ -197,7 +200,7 @@ def test_a_good_guess_saves_iterations():
 
 @pytest.mark.parametrize("way", SOLVERS)
 def test_gradients_are_those_of_a_dense_solve(way):
-    """A wrong adjoint. Dense float64 torch solve, mean and pins as in the reference; 1e-5 of the largest entry."""
+    """The adjoint would be wrong. Against a dense float64 torch solve with mean and pins; 1e-5 of the largest entry."""
     rest, goal, phi, mean = problem("two_components")
     pins = np.array([0, 5, 9])
     targets = torch.tensor(goal[pins] + 0.05, dtype=torch.float32)
@@ -231,7 +234,7 @@ def test_gradients_are_those_of_a_dense_solve(way):
 
 
 def test_operator_passes_opcheck():
-    """An operator that torch.compile would break on: schema, fake tensors, autograd registration."""
+    """torch.compile would fail on the operator: schema, fake tensors, autograd registration."""
     rest, _, phi, mean = problem("tetrahedron")
     solver = solver_for(rest, pins=[1])
     arguments = (torch.tensor(phi).requires_grad_(), torch.tensor(mean).requires_grad_(), torch.ones(1, 3))
@@ -241,7 +244,7 @@ def test_operator_passes_opcheck():
 
 @pytest.mark.parametrize("way", SOLVERS)
 def test_many_lanes_give_the_same_result(monkeypatch, way):
-    """A missing barrier or a wrong stride, which one lane can't show. 256 lanes a block, as on a GPU."""
+    """A barrier would be missing or a stride wrong, which one lane cannot show. 256 lanes per block, as on a GPU."""
     rest, _, phi, mean = problem("small" if way == "explicit" else "two_components")  # a block a row takes long
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", False)
     solver = solver_for(rest, pins=[0, 1], **SOLVERS[way])
@@ -253,7 +256,7 @@ def test_many_lanes_give_the_same_result(monkeypatch, way):
 
 
 def test_reaching_the_limit_is_said_once():
-    """An iteration that ends unconverged without a word, or one that warns every frame."""
+    """An iteration would stop unconverged without a warning, or warn in every frame."""
     rest, _, phi, mean = problem("fine")
     solver = solver_for(rest, max_iterations=9, factor_budget=0)
     with pytest.warns(RuntimeWarning, match="raise max_iterations"):
@@ -266,7 +269,7 @@ def test_reaching_the_limit_is_said_once():
 
 @pytest.mark.parametrize("way", SOLVERS)
 def test_not_a_number_ends(way):
-    """NaN in, and an iteration that never stops or a result that looks like one."""
+    """With NaN in the input, the iteration would never stop, or the result would be finite."""
     rest, _, phi, mean = problem("skirt")
     phi[4] = np.nan
     assert not solver_for(rest, **SOLVERS[way]).solve(torch.tensor(phi), torch.tensor(mean)).isfinite().any()
@@ -274,7 +277,7 @@ def test_not_a_number_ends(way):
 
 @pytest.mark.parametrize("way", ["substitution", "explicit"])
 def test_budget_of_the_factors_is_kept(way):
-    """A batch that allocates without a limit. One of two skirts fits; the result is the same, and equal ones share."""
+    """A batch would allocate without a limit. One of two skirts fits; the result is the same, and equal ones share."""
     first, second = meshes.skirt(24, 8), meshes.skirt(22, 8)
     alone = solver_for(first, **SOLVERS[way])
     entries = sum(_factor(alone)[name].numel() for name in ("value", "row_value"))
@@ -292,7 +295,7 @@ def test_budget_of_the_factors_is_kept(way):
 
 
 def test_a_factor_that_cannot_be_trusted_is_not_used():
-    """Elimination that loses the solution of a nearly singular matrix, and garments that fly apart without a word."""
+    """Elimination would lose the solution of a nearly singular matrix, and garments fly apart without a warning."""
     rest = meshes.irregular_grid(9, 7)
     matrix = laplacian.cotangent_laplacian(rest.vertices, rest.faces)
     count, largest = len(rest.vertices), matrix.diagonal().max()
@@ -306,7 +309,7 @@ def test_a_factor_that_cannot_be_trusted_is_not_used():
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_factor_is_that_of_the_matrix(flat):
-    """A wrong order, pivot or place. L D Lᵀ, or the inverse of W, is the permuted matrix to rounding.
+    """An order, pivot or place would be wrong. L D Lᵀ, or the inverse of W, is the permuted matrix to rounding.
 
     The diagonals of a regular grid weigh nothing, so that entries of its L cancel.
     """
@@ -360,7 +363,7 @@ def _factor(solver: PoissonSolver) -> dict[str, torch.Tensor]:
     ],
 )
 def test_bad_meshes_are_refused(change, error, message):
-    """A kernel that reads outside of its arrays, or divides by an area of zero."""
+    """A kernel would read outside of its arrays, or divide by an area of zero."""
     rest = meshes.tetrahedron()
     arguments = {"rest_vertices": torch.tensor(rest.vertices), "faces": torch.tensor(rest.faces), **change}
     with pytest.raises(error, match=message):
@@ -379,7 +382,7 @@ def test_bad_meshes_are_refused(change, error, message):
     ],
 )
 def test_bad_arguments_are_refused(change, error, message):
-    """A kernel that reads outside of its arrays."""
+    """A kernel would read outside of its arrays."""
     arguments = {"phi": torch.zeros(4, 3, 3), "mean": torch.zeros(1, 3), "pin_targets": torch.zeros(1, 3), **change}
     solver = solver_for(meshes.tetrahedron(), pins=[0])
     with pytest.raises(error, match=message):

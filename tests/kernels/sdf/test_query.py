@@ -278,7 +278,7 @@ def test_a_face_without_area_hides_nothing():
 
 
 def test_nothing_asked_nothing_answered():
-    """No points: empty results, zero gradient for the body."""
+    """Without points the query would fail, or the body get a gradient that is not zero."""
     vertices, faces = tensors(BODIES["tetrahedron"])
     points = torch.zeros(0, 3, requires_grad=True)
     vertices.requires_grad_()

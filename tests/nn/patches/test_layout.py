@@ -60,7 +60,7 @@ def dense(found, faces: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", ["skirt", "two pieces", "crumbs"])
 def test_pooling_is_the_area_weighted_mean(name):
-    """Small faces would speak as loud as large ones, or a patch's mean not be one; 1e-6 for float32."""
+    """Small faces would count as much as large ones, or a patch's mean not be one; 1e-6 for float32."""
     worn = garment(name)
     found = garment_patches(worn, SPACING)
     share, pooled = dense(found, len(worn.faces))
@@ -97,7 +97,7 @@ def test_patches_do_not_depend_on_the_resolution():
 
 
 def test_neighbours():
-    """A face would hear faces that it shares no edge with; compared with all pairs."""
+    """A face would be averaged with faces with which it shares no edge. Compared with a search of all pairs."""
     faces = two_components().faces
     found = edge_neighbours(faces)
     edges = [{frozenset(e) for e in zip(f, np.roll(f, -1), strict=True)} for f in faces.tolist()]

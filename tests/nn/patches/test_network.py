@@ -59,7 +59,7 @@ SHEET, PIECES, SKIRT = (Garment(*mesh) for mesh in (irregular_grid(8, 5), two_co
 
 
 def layout(*garments: Garment, config: NetworkConfig | None = None) -> PatchLayout:
-    """Their patches."""
+    """The patch layout of garments."""
     config = config or NetworkConfig.fast(**TINY)
     found = [garment_patches(garment, config.patch_spacing) for garment in garments]
     return patch_layout(found, config.geodesic_radius, config.geodesic_power)
@@ -250,7 +250,7 @@ def test_gradients_are_finite_and_reach_every_weight():
 def test_cost_is_linear_in_the_faces():
     """The cost would grow with the square of the faces, or the count of operations be another than what runs.
 
-    Operations as PyTorch counts them, on meshes with the same patches; attention by plain products,
+    Operations as PyTorch counts them, on meshes with the same patches, with attention by plain products,
     which alone PyTorch counts on a CPU.
     """
     network = tiny()

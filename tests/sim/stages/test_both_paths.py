@@ -41,7 +41,7 @@ def learned(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def prediction(scene, broken: int | None = None) -> Step:
-    """Small deformations; of one garment not finite."""
+    """A prediction of small deformations, which is not finite for one garment."""
     torch.manual_seed(0)
     faces, components = len(scene.packed.faces), scene.packed.component_count
     psi = torch.eye(3) + 0.05 * torch.randn(faces, 3, 3)
@@ -52,14 +52,17 @@ def prediction(scene, broken: int | None = None) -> Step:
 
 
 def test_centroids(scene, frame):
-    """1e-6 m."""
+    """Training would follow other centroids than a rollout. 1e-6 m."""
     found, other = scene.centroids(frame[0]), scene.centroids(learned(frame[0]))
     assert other.requires_grad
     torch.testing.assert_close(other, found, rtol=0, atol=1e-6)
 
 
 def test_features(scene, frame):
-    """1e-5; in metres or of the size of 1. Nearest faces that are known already give what finding them gives."""
+    """Training would see other features than a rollout, or cached nearest faces give others.
+
+    1e-5, in m or without unit.
+    """
     vertices, now, then = frame
     found, other = scene.features(vertices, now, then), scene.features(learned(vertices), now, then)
     assert other.requires_grad
@@ -73,8 +76,10 @@ def test_features(scene, frame):
 
 @pytest.mark.parametrize("broken", [None, 1])
 def test_reconstruction(scene, frame, broken):
-    """1e-5 of deformation gradients, 2e-5 m of positions, which the Poisson solve finds to 1e-5 m; the garment that is
-    not finite stays where it is."""
+    """Training would solve for other positions than a rollout, or move the garment that is not finite.
+
+    1e-5 for deformation gradients; 2e-5 m for positions, since the Poisson solve has an error of 1e-5 m.
+    """
     vertices, now, then = frame
     features, step = scene.features(vertices, now, then), prediction(scene, broken)
     followed = Step(*map(learned, step))
@@ -92,7 +97,7 @@ def test_reconstruction(scene, frame, broken):
 
 
 def test_contact(scene, frame):
-    """Exact: the same kernels. Without the depth of the result, as in training, the positions are the same too."""
+    """Training, which does not measure depths, would move cloth otherwise than a rollout. Exact: the same kernels."""
     vertices, now, then = frame
     origin = scene.contact.origin(vertices, scene.features(vertices, now, then))
     finite = torch.tensor([True, True, True])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 from support.readers import QUADS, STRIP, TRIANGLES, moving, write_obj, write_point_cache, write_usda
@@ -83,6 +85,52 @@ def test_meshes_of_one_usd_stage(tmp_path):
     assert [g.rest.name for g in recording((stage, "jacket")).garments] == ["jacket"]
     with pytest.raises(MeshError, match=r"2 meshes: /shirt, /jacket. Name one"):
         recording(stage)
+
+
+def starting(folder, name: str, frames: np.ndarray, start: float, mesh, polygons):
+    """A point cache that starts at a frame."""
+    write_obj(folder / f"{name}.obj", mesh, polygons)
+    head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, frames.shape[1], start, 1.0, len(frames))
+    (folder / f"{name}.pc2").write_bytes(head + np.ascontiguousarray(frames, "<f4").tobytes())
+    return folder / f"{name}.pc2"
+
+
+def test_files_that_start_at_other_frames_are_put_together_by_time(tmp_path):
+    """If this fails, a dress is recorded on the body of another moment: frame k of both files, whatever k means."""
+    cloth, under = moving(STRIP, 12), body_motion(12).vertices
+    dress = starting(tmp_path, "dress", cloth[3:10], 1003, STRIP * 0.5, QUADS)
+    whole = starting(tmp_path, "body", under, 1000, BODY, BODY_FACES)
+    with pytest.warns(UserWarning, match=r"dress 1003 to 1009, body 1000 to 1011; the 7 frames from 1003 on are kept"):
+        made = recording(dress, whole, fps=24)
+    np.testing.assert_array_equal(made.garments[0].vertices, cloth[3:10].astype(np.float32))
+    np.testing.assert_array_equal(made.body.vertices, under[3:10])
+    shot = BodyMotion(under[:8], BODY_FACES, 24.0, start=1000 / 24)
+    shot.save(tmp_path / "shot.npz")
+    for body in (shot, tmp_path / "shot.npz"):
+        with pytest.warns(UserWarning, match="the 5 frames from 1003 on are kept"):
+            made = recording(dress, body, fps=24)
+        np.testing.assert_array_equal(made.garments[0].vertices, cloth[3:8].astype(np.float32))
+        np.testing.assert_array_equal(made.body.vertices, under[3:8])
+    with pytest.raises(MeshError, match=r"no frame in common: dress 1003 to 1009, body 2000 to 2011"):
+        recording(dress, starting(tmp_path, "later", under, 2000, BODY, BODY_FACES), fps=24)
+    with pytest.raises(MeshError, match=r"lie between each other: dress 1003 to 1009, body 1000\.5 to"):
+        recording(dress, starting(tmp_path, "half", under, 1000.5, BODY, BODY_FACES), fps=24)
+    with pytest.warns(UserWarning, match="some files start at frame 1003, some at 0, with 7 frames"):
+        made = recording(dress, starting(tmp_path, "zero", under[:7], 0, BODY, BODY_FACES), fps=24)
+    assert len(made) == 7
+
+
+def test_resampled_recordings_hold_no_frame(tmp_path):
+    """If this fails, cloth is taught to stop at the end of each sequence: 24 frames at 24 a second last 28.75 of 30.
+
+    Steps are alike to 1e-5 m: positions are float32, up to 17 m from the origin.
+    """
+    cloth = moving(STRIP, 24)
+    made = recording(starting(tmp_path, "dress", cloth, 0, STRIP * 0.5, QUADS), body_motion(24, 24.0), fps=24)
+    fast = made.resampled(30.0)
+    assert (len(fast), len(fast.body), fast.fps) == (29, 29, 30.0)
+    steps = np.linalg.norm(np.diff(fast.garments[0].vertices, axis=0), axis=-1)
+    np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-5)
 
 
 @pytest.mark.filterwarnings("ignore:.*no rest shape")

@@ -1,4 +1,4 @@
-"""The cache of body interactions: what comes out of it is what was computed, whatever happened to its files."""
+"""The cache of body interactions: its values are those that were computed, even after damage to its files."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_a_write_that_stops_midway_leaves_nothing(folder, tmp_path, monkeypatch)
 
 
 def test_key_depends_on_the_version(folder, monkeypatch):
-    """What an older version has computed otherwise is taken for this one's."""
+    """Values that an older version computed otherwise would be used."""
     key = interactions.key_of(folder)
     assert interactions.warpgarment.__version__ == version("warpgarment")
     monkeypatch.setattr(interactions.warpgarment, "__version__", "another")

@@ -1,5 +1,4 @@
-"""The data of a run: what is bad is skipped, counted, with a reason, never fatal, never silent; the cache is by
-content."""
+"""The data of a run: bad sequences are skipped and counted, with a reason; cache folders depend on the content."""
 
 from __future__ import annotations
 
@@ -55,6 +54,7 @@ BAD = {  # name: (settings of the sequence, what is done to its folder, what the
     "no_manifest": ({}, lambda folder: (folder / "manifest.json").unlink(), "manifest.json"),
     "bad_manifest": ({}, overwrite("manifest.json", b'{"status": "go'), "manifest.json"),
     "odd_manifest": ({}, change_manifest(fps="thirty"), "thirty"),
+    "other_rate": ({}, change_manifest(fps=24.0), "24 frames a second and the network at 30"),
 }
 
 
@@ -113,7 +113,7 @@ def test_nothing_usable_is_said(root, tmp_path):
     content = good.read_bytes()
     good.unlink()
     try:
-        with pytest.raises(train.NoTrainingData, match="6 training sequences, none usable"):
+        with pytest.raises(train.NoTrainingData, match="7 training sequences, none usable"):
             load_sequences(config, SMALL, {}, Group("cpu"))
     finally:
         good.write_bytes(content)

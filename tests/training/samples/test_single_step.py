@@ -199,7 +199,7 @@ def test_joint_yaw_turns_the_sample(loaded):
 
 
 def test_noise_has_the_stated_size_and_spares_pins():
-    """Amplitudes off, or pinned vertices displaced. 15 %: 400 draws of a few dozen fields."""
+    """Amplitudes would be wrong, or pinned vertices displaced. 15 %: 400 draws of a few dozen fields."""
     vertices, faces = synthetic_sequences.tube(16, 12, 0.2, 0.0, 1.0)
     pins = np.arange(16)
     free = NoiseBasis(faces, np.zeros(len(vertices), int), np.zeros(0, int))
@@ -235,7 +235,7 @@ def test_loss_is_the_weighted_sum_of_absolute_differences():
     "name", [n for n, f in inspect.getmembers(losses, inspect.isfunction) if f.__module__ == losses.__name__]
 )
 def test_types_of_losses_can_be_looked_up(name):
-    """A function's types name something that the file does not import: whoever asks for them gets a NameError."""
+    """A type in a signature is not imported, so that reading the annotations is a NameError."""
     assert "return" in typing.get_type_hints(getattr(losses, name))
 
 

@@ -267,7 +267,7 @@ def test_a_resumed_unrolled_run_repeats_the_uninterrupted_one(data, tmp_path, mo
 
 
 def test_an_unrolled_loss_that_is_not_finite_stops_the_run(data, tmp_path, monkeypatch):
-    """As for one-step training: the batch is kept."""
+    """A diverged unrolled run would go on, or its batch would be lost, as for one-step training."""
     build = UnrolledBuilder.build
 
     def poisoned(self, picks, faces, rng, displacements=None, part=slice(None)):

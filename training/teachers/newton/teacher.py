@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpgarment.errors import MissingExtra
+from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.kernels.wind import add_air_forces
 from warpgarment.training.teachers import ClothScene
 from warpgarment.training.teachers.scenes import check_scenes
@@ -53,6 +53,7 @@ class NewtonTeacher:
 
     Raises:
         MissingExtra: Newton is not installed.
+        UsageError: Warp has no such device.
     """
 
     name = "newton"
@@ -62,6 +63,10 @@ class NewtonTeacher:
             import newton
         except ImportError as error:
             raise MissingExtra("physics", "Simulating cloth with Newton") from error
+        there = [one.alias for one in wp.get_devices()]  # asking for one that is not there prints the driver's errors
+        known = device is None or device in there or (device == "cuda" and len(there) > 1)
+        if not known:
+            raise UsageError(f"there is no device {device!r} to simulate on. Warp sees {', '.join(there)}.")
         self._newton, self._settings, self._device = newton, settings or NewtonSettings(), device
 
     def settings(self) -> dict[str, Any]:

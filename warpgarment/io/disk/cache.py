@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from .atomic import atomic_file
+from .plain import check_plain
 
 OFF = "WARPGARMENT_NO_CACHE"
 LARGEST = 2**29  # bytes of arrays that are kept, for one key
@@ -72,6 +73,7 @@ def remembered(
 
 def _read(path: Path, expected: Mapping[str, tuple[str, tuple[int | None, ...]]]) -> dict[str, np.ndarray] | None:
     try:
+        check_plain(path)
         with safe_open(path, framework="numpy") as file:
             if set(file.keys()) != set(expected):
                 return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -53,3 +54,27 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
             pass
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error} ({above}).") from error
+
+
+def check_space(path: Path, needed: float) -> None:
+    """Refuses an output for which the disk has no room, as far as the disk says how much it has.
+
+    Args:
+        path: The file or folder to write; its parents need not exist.
+        needed: About how many bytes it will take.
+
+    Raises:
+        OutputError: Less is free.
+    """
+    above = Path(path)
+    while not above.is_dir() and above != above.parent:
+        above = above.parent
+    try:
+        free = shutil.disk_usage(above).free
+    except OSError:
+        return
+    if free < needed:
+        raise OutputError(
+            f"{path}: about {needed / 1e6:,.0f} MB would be written, and {free / 1e6:,.0f} MB are free on the disk "
+            f"({above}). Make room, or choose another place."
+        )

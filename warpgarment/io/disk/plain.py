@@ -10,6 +10,9 @@ from typing import IO, Any
 
 from warpgarment.errors import MeshError
 
+LARGEST = 4 << 30  # bytes of a file that is read into memory as a whole
+_PIECE = 1 << 20  # bytes that are read at a time
+_NO_TEXT = bytes(4)  # zeros that no text has in a row, whatever its encoding
 JSON_LARGEST = 16 << 20  # bytes
 JSON_DEEPEST = 32  # objects and arrays within each other
 
@@ -39,6 +42,35 @@ def open_plain(path: str | os.PathLike[str], largest: int | None = None) -> IO[b
     return os.fdopen(handle, "rb")
 
 
+def check_plain(path: str | os.PathLike[str], largest: int | None = None) -> None:
+    """Refuses what `open_plain` refuses, before a library that opens files by name is given one."""
+    open_plain(path, largest).close()
+
+
+def read_plain(path: str | os.PathLike[str], largest: int = LARGEST, *, text: bool = False) -> bytes:
+    """All bytes of a file of bounded size.
+
+    Args:
+        path: File to read.
+        largest: Most bytes it may have.
+        text: Whether it should be text: reading ends at the first zeros that no text has, so that a file of gigabytes
+            that is one hole takes no memory.
+
+    Raises:
+        MeshError: It is no plain file, larger than that, or no text; the error says which.
+        OSError: It cannot be read.
+    """
+    with open_plain(path, largest) as file:
+        if not text:
+            return file.read()
+        pieces: list[bytes] = []
+        while piece := file.read(_PIECE):
+            if _NO_TEXT in piece:
+                raise MeshError(f"{path}: binary data; this is not a text file, as its name says.")
+            pieces.append(piece)
+        return b"".join(pieces)
+
+
 def read_json(path: str | os.PathLike[str]) -> Any:
     """What a JSON file of bounded size and depth holds.
 
@@ -46,10 +78,21 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         MeshError: It is no plain file, larger or more deeply nested than the bounds, or no JSON; the error says which.
         OSError: It cannot be read.
     """
-    with open_plain(path, JSON_LARGEST) as file:
-        data = file.read()
+    return parsed_json(path, read_plain(path, JSON_LARGEST))
+
+
+def parsed_json(path: object, data: str | bytes) -> Any:
+    """What a JSON text of bounded depth holds.
+
+    Args:
+        path: Where it is from, for messages.
+        data: The text, in UTF-8.
+
+    Raises:
+        MeshError: It is more deeply nested than the bound, or no JSON; the error says which.
+    """
     try:
-        value = json.loads(data.decode("utf-8"))
+        value = json.loads(data.decode("utf-8") if isinstance(data, bytes) else data)
         level: list[Any] = [value]
         for _ in range(JSON_DEEPEST + 1):
             level = [part for part in level if isinstance(part, (dict, list))]

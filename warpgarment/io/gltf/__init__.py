@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.io.data import Format, MeshData, MotionData, ReadOptions
+from warpgarment.io.data import Format, Holds, MeshData, MotionData, ReadOptions
 from warpgarment.io.joined import join_exact
 from warpgarment.io.parts import ALL, Parts, connected_pieces, listed, named, unconnected
 from warpgarment.io.surface.record import say_left_out, worth_keeping
@@ -18,10 +17,10 @@ from .animation import Channels
 from .container import Document
 from .looks import SETS, surface_of
 from .scene import Placed, Scene
+from .schema import Damaged
 from .writing import write_gltf
 
 LARGEST, RATIO = 256 << 20, 1_000  # bytes of positions from which on a file must have a thousandth of them
-_DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, struct.error)
 
 
 def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tuple[MotionData, str]:
@@ -52,12 +51,9 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
                 f"of {document.size:,}. More than {LARGEST:,} are read only of files with a thousandth of that."
             )
         placed = [scene.placed(number) for number in scene.meshes]
-    except MeshError:
-        raise
-    except _DAMAGE as error:
+    except Damaged as error:
         raise MeshError(
-            f"{path}: not a readable glTF file ({type(error).__name__}: {str(error)[:200]}). "
-            "It is damaged, cut short, or of another kind."
+            f"{path}: not a readable glTF file ({str(error)[:200]}). It is damaged, cut short, or of another kind."
         ) from None
     placed = [one for one in placed if len(one.faces)]
     if not placed:
@@ -75,14 +71,9 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
                 f'mesh="{ALL}".'
             )
     name = placed[0].name if len(placed) == 1 else ""
-    start = float(codes[0]) * frames.fps if frames.fps else 0.0
+    seconds = float(codes[0]) if len(frames.codes) else None
     surface = worth_keeping(path, lambda: surface_of(path, document, placed, split, faces))
-    return MotionData(vertices, faces, _rate(frames.fps), name=name, start=start, surface=surface), name
-
-
-def _rate(fps: float | None) -> float | None:
-    """A rate without the rounding of times that are float32: whole where it is nearly."""
-    return float(round(fps)) if fps is not None and abs(fps - round(fps)) < 1e-5 * fps else fps
+    return MotionData(vertices, faces, frames.fps, name=name, seconds=seconds, surface=surface), name
 
 
 def _still(document: Document) -> Document:
@@ -125,4 +116,14 @@ def _write_motion(path: Path, data: MotionData) -> None:
     write_gltf(path, data)
 
 
-FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True, axis=True)
+def _holds(path: Path) -> Holds:
+    try:
+        document = Document(path)
+        return Holds(
+            tuple(dict.fromkeys(Scene(document, Channels(_still(document), path), np.zeros(1)).names())), 1.0, "y"
+        )
+    except Damaged:
+        return Holds((), 1.0, "y")
+
+
+FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True, axis=True, holds=_holds)

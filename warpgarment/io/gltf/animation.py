@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .container import Document
+from .schema import ANIMATION, Damaged
 
 SIZES = {"translation": 3, "rotation": 4, "scale": 3}
 DEFAULTS = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
@@ -24,30 +25,37 @@ class Channels:
     def __init__(self, document: Document, where: object):
         self._keys: dict[tuple[int, str], tuple[np.ndarray, np.ndarray, str]] = {}
         animations = document.json.get("animations", [])
+        if not isinstance(animations, list):
+            raise Damaged("animations is no list")
         if len(animations) > 1:
-            names = ", ".join(str(a.get("name", k)) for k, a in enumerate(animations[:8]))
+            names = ", ".join(str(a.get("name", k)) for k, a in enumerate(animations[:8]) if isinstance(a, dict))
             warnings.warn(
                 f"{where}: {len(animations)} animations ({names}); the first is read.", UserWarning, stacklevel=6
             )
         if not animations:
             return
         animation = document.item("animations", 0)
+        ANIMATION("animations[0]", animation)
         for channel in animation["channels"]:
             target = channel["target"]
             if "node" in target:
                 document.item("nodes", target["node"])
             if "node" not in target or target["path"] not in (*SIZES, "weights"):
                 continue
+            if channel["sampler"] >= len(animation["samplers"]):
+                raise Damaged(f"an animation has no sampler {channel['sampler']}")
             sampler = animation["samplers"][channel["sampler"]]
             times = document.array(sampler["input"]).astype(np.float64)
             values = document.array(sampler["output"]).astype(np.float64)
             if times.ndim != 1 or len(times) == 0 or not (np.diff(times) > 0).all() or not np.isfinite(times).all():
-                raise ValueError("the times of an animation do not rise")
+                raise Damaged("the times of an animation do not rise")
             kind = sampler.get("interpolation", "LINEAR")
             rows = len(times) * (3 if kind == "CUBICSPLINE" else 1)
+            if values.size == 0 or values.size % rows:
+                raise Damaged(f"{values.size} values of an animation at {len(times)} times")
             values = values.reshape(rows, -1)
             if target["path"] in SIZES and values.shape[1] != SIZES[target["path"]]:
-                raise ValueError(f"an animation's {target['path']} has {values.shape[1]} values")
+                raise Damaged(f"an animation's {target['path']} has {values.shape[1]} values")
             self._keys[target["node"], target["path"]] = (times, values, kind)
 
     def times(self) -> np.ndarray:

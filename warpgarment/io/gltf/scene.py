@@ -9,6 +9,7 @@ from scipy.sparse import csr_matrix
 
 from .animation import Channels, local_matrices
 from .container import Document
+from .schema import Damaged
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
@@ -48,7 +49,7 @@ class Scene:
             for child in document.item("nodes", number).get("children", []):
                 document.item("nodes", child)
                 if child in self._parents:
-                    raise ValueError(f"node {child} has two parents")
+                    raise Damaged(f"node {child} has two parents")
                 self._parents[child] = number
         scenes = document.json.get("scenes")
         roots = set(document.item("scenes", document.json.get("scene", 0)).get("nodes", [])) if scenes else None
@@ -58,13 +59,23 @@ class Scene:
             if "mesh" in node and (roots is None or self._chain(number)[-1] in roots):
                 self.meshes.append(number)
 
+    def names(self) -> list[str]:
+        """What the meshes of the scene are called, in the order of `meshes`."""
+        return [self._name(number) for number in self.meshes]
+
+    def _name(self, number: int) -> str:
+        """The name of a node, else of its mesh, else its number."""
+        node = self._document.item("nodes", number)
+        name = node.get("name") or self._document.item("meshes", node["mesh"]).get("name")
+        return str(name or f"node {number}")
+
     def _chain(self, number: int) -> list[int]:
         """A node, its parent, and so on."""
         chain = [number]
         while chain[-1] in self._parents:
             chain.append(self._parents[chain[-1]])
             if len(chain) > len(self._document.json["nodes"]):
-                raise ValueError(f"node {number} is its own ancestor")
+                raise Damaged(f"node {number} is its own ancestor")
         return chain
 
     def _matrices(self, number: int) -> np.ndarray:
@@ -79,7 +90,7 @@ class Scene:
     def size(self, number: int) -> int:
         """Vertices of the mesh of a node."""
         mesh = self._document.item("meshes", self._document.item("nodes", number)["mesh"])
-        return sum(len(self._document.array(p["attributes"]["POSITION"])) for p in mesh["primitives"])
+        return sum(len(self._document.array(_accessor(p["attributes"], "POSITION"))) for p in mesh["primitives"])
 
     def placed(self, number: int) -> Placed:
         """The mesh of a node, all its primitives."""
@@ -101,7 +112,7 @@ class Scene:
         together = [np.broadcast_to(v, (count, *v.shape[1:])) for v in vertices]
         name = str(mesh.get("name", ""))
         return Placed(
-            str(node.get("name", "")) or name or f"node {number}",
+            self._name(number),
             name,
             np.concatenate(together, axis=1) if together else np.zeros((1, 0, 3)),
             np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64),
@@ -113,7 +124,7 @@ class Scene:
     ) -> np.ndarray:
         """Positions in the world, [T,V,3], or [1,V,3] where nothing moves."""
         attributes = primitive["attributes"]
-        points = _points(self._document.array(attributes["POSITION"]))[None]
+        points = _points(self._document.array(_accessor(attributes, "POSITION")))[None]
         targets = [t["POSITION"] for t in primitive.get("targets", []) if "POSITION" in t]
         if targets:
             every = [k for k, t in enumerate(primitive["targets"]) if "POSITION" in t]
@@ -121,6 +132,8 @@ class Scene:
             if weights is None:
                 still = node.get("weights", mesh.get("weights", [0.0] * len(primitive["targets"])))
                 weights = np.array(still, dtype=np.float64)[None]
+            if weights.shape[1] != len(primitive["targets"]):
+                raise Damaged(f"{weights.shape[1]} weights for {len(primitive['targets'])} morph targets")
             moves = np.stack([_points(self._document.array(target), points.shape[1]) for target in targets])
             points = points + (weights[:, every] @ moves.reshape(len(moves), -1)).reshape(
                 len(weights), *moves.shape[1:]
@@ -136,13 +149,19 @@ class Scene:
         bind = np.tile(np.eye(4), (len(joints), 1, 1))
         if "inverseBindMatrices" in skin:
             bind = self._document.array(skin["inverseBindMatrices"]).astype(np.float64)
+            if bind.ndim != 2 or bind.shape[1] != 16 or len(bind) < len(joints):
+                raise Damaged(f"matrices of shape {list(bind.shape)} for {len(joints)} joints")
             bind = bind.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(joints)]
         world = [self._matrices(self._checked(joint)) @ matrix for joint, matrix in zip(joints, bind, strict=True)]
         sets = [k for k in range(8) if f"JOINTS_{k}" in attributes]
-        index = np.concatenate([self._document.array(attributes[f"JOINTS_{k}"]) for k in sets], axis=1).astype(int)
-        weight = np.concatenate([self._document.array(attributes[f"WEIGHTS_{k}"]) for k in sets], axis=1).astype(float)
-        if index.shape != weight.shape or len(index) != count or index.max() >= len(joints):
-            raise ValueError("joints and weights of a skin do not fit its mesh")
+        each_index = [self._document.array(attributes[f"JOINTS_{k}"]) for k in sets]
+        each_weight = [self._document.array(_accessor(attributes, f"WEIGHTS_{k}")) for k in sets]
+        if not sets or not joints or any(a.shape != (count, 4) for a in (*each_index, *each_weight)):
+            raise Damaged("joints and weights of a skin do not fit its mesh")
+        index, weight = np.concatenate(each_index, axis=1), np.concatenate(each_weight, axis=1).astype(float)
+        if index.dtype.kind != "u" or (count and index.max() >= len(joints)):
+            raise Damaged("joints of a skin that there are not")
+        index = index.astype(int)
         total = weight.sum(axis=1, keepdims=True)
         weight = np.where(total > 0, weight / np.where(total > 0, total, 1.0), 0.0)
         rows = np.repeat(np.arange(count), index.shape[1])
@@ -163,15 +182,15 @@ class Scene:
         if "indices" in primitive:
             corners = self._document.array(primitive["indices"])
             if corners.ndim != 1 or corners.dtype.kind != "u":
-                raise ValueError("indices that are no whole numbers")
+                raise Damaged("indices that are no whole numbers")
             corners = corners.astype(np.int64)
         else:
             corners = np.arange(count)
         if len(corners) and corners.max() >= count:
-            raise ValueError(f"a face names vertex {int(corners.max()):,}, and there are {count:,}")
+            raise Damaged(f"a face names vertex {int(corners.max()):,}, and there are {count:,}")
         if mode == TRIANGLES:
             if len(corners) % 3:
-                raise ValueError(f"{len(corners):,} corners are no triangles")
+                raise Damaged(f"{len(corners):,} corners are no triangles")
             return corners.reshape(-1, 3)
         k = np.arange(max(len(corners) - 2, 0))
         if mode == FAN:
@@ -179,7 +198,14 @@ class Scene:
         return np.stack([corners[k], corners[k + 1 + k % 2], corners[k + 2 - k % 2]], axis=1)
 
 
+def _accessor(attributes: dict[str, Any], name: str) -> int:
+    """The accessor of an attribute that must be there."""
+    if name not in attributes:
+        raise Damaged(f"a primitive without {name}")
+    return attributes[name]
+
+
 def _points(array: np.ndarray, count: int | None = None) -> np.ndarray:
     if array.ndim != 2 or array.shape[1] != 3 or (count is not None and len(array) != count):
-        raise ValueError(f"positions of shape {list(array.shape)}")
+        raise Damaged(f"positions of shape {list(array.shape)}")
     return array.astype(np.float64)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from warpgarment.errors import MeshError
+from warpgarment.io.data import Holds
+from warpgarment.io.disk.plain import check_plain
 from warpgarment.io.polygons import triangulate_counts
 from warpgarment.io.surface.record import Surface, worth_keeping
 from warpgarment.io.times import Frames, frames_of
@@ -26,7 +30,7 @@ class UsdMesh(NamedTuple):
     vertices: np.ndarray  # float32 [T,V,3]
     faces: np.ndarray  # int64 [F,3]
     fps: float | None  # None for a single frame
-    start: float = 0.0  # time of the first frame in frames: its time code, where the stage counts frames
+    start: float = 0.0  # time of the first frame in frames: its time code, where the stage counts frames; of one, [s]
     surface: Surface | None = None  # polygons as they are seen from outside; None: triangles alone
 
 
@@ -51,18 +55,13 @@ def read_usd(
         MissingExtra: usd-core is not installed.
         FileNotFoundError: There is no such file.
     """
-    _, _, Usd, UsdGeom, _ = pxr()
-    from pxr import Tf
-
     path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"No such file: {path}")
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException:
-        stage = None
-    if stage is None:
-        raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
+    with _opened(path) as stage:
+        return _read(stage, path, mesh, frames, convert, turn)
+
+
+def _read(stage: Any, path: Path, mesh: str | None, frames: bool, convert: bool, turn: bool) -> UsdMesh:
+    _, _, Usd, UsdGeom, _ = pxr()
     prim = _choose(stage, mesh, path, Usd, UsdGeom)
     where = f"{path}: mesh {prim.GetName()!r}"
     skinning = skinning_of(prim)
@@ -93,9 +92,48 @@ def read_usd(
     if convert:
         vertices = vertices * UsdGeom.GetStageMetersPerUnit(stage)
     fps = chosen.fps
-    start = float(chosen.codes[0]) * fps / stage.GetTimeCodesPerSecond() if fps else 0.0
+    start = float(chosen.codes[0]) * (fps or 1.0) / stage.GetTimeCodesPerSecond() if len(chosen.codes) else 0.0
     with np.errstate(over="ignore"):
         return UsdMesh(prim.GetName(), vertices.astype(np.float32), faces, fps, start, surface)
+
+
+def usd_holds(path: Path) -> Holds:
+    """Meshes that a stage shows, by path where two have the same name, its unit and axis; raises as `read_usd`."""
+    _, _, Usd, UsdGeom, _ = pxr()
+    with _opened(path) as stage:
+        prims = [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
+        shown = [p for p in prims if _is_shown(p, Usd, UsdGeom)] or prims
+        names = [p.GetName() for p in shown]
+        names = [name if names.count(name) == 1 else str(p.GetPath()) for name, p in zip(names, shown, strict=True)]
+        up = "z" if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else "y"
+        return Holds(tuple(names), float(UsdGeom.GetStageMetersPerUnit(stage)), up)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The stage of a file; what USD finds damaged, also while a value is unpacked when it is first read, is named."""
+    from pxr import Tf, Usd
+
+    if not path.exists():
+        raise FileNotFoundError(f"No such file: {path}")
+    check_plain(path)
+    try:
+        stage = Usd.Stage.Open(str(path))
+        if stage is None:
+            raise MeshError(f"{path}: USD cannot open it. It is damaged, cut short, or of another kind.")
+        yield stage
+    except Tf.ErrorException as error:
+        raise MeshError(
+            f"{path}: USD cannot read it ({_words(error)}). It is damaged, cut short, or of another kind."
+        ) from None
+
+
+def _words(error: Exception) -> str:
+    """The end of what USD says; it quotes the file, whose bytes may be no text."""
+    try:
+        return " ".join(str(error).split())[-200:]
+    except UnicodeDecodeError:
+        return "it is not text in UTF-8"
 
 
 def _choose(stage: Any, mesh: str | None, path: Path, Usd: Any, UsdGeom: Any) -> Any:

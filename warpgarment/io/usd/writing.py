@@ -38,16 +38,19 @@ def write_usd(
     meshes: Sequence[tuple[str, np.ndarray, np.ndarray]],
     fps: float,
     surfaces: Sequence[Surface | None] = (),
+    *,
+    start: float = 0.0,
 ) -> None:
     """Writes meshes as one stage, completely or not at all.
 
-    Y up, metresPerUnit 1, one time code a frame from 0, no subdivision, extents for every frame.
+    Y up, metresPerUnit 1, one time code a frame from `start`, no subdivision, extents for every frame.
 
     Args:
         path: .usd, .usda or .usdc.
         meshes: Name, vertices [T,V,3] in metres and faces [F,3] of each, such as garment and body; the same T for all.
         fps: Time codes (frames) per second.
         surfaces: What is written of each mesh instead of its triangles; None, or none for all: nothing.
+        start: Time code of the first frame.
 
     Raises:
         MeshError: Other shapes, indices out of range, or different numbers of frames.
@@ -72,8 +75,8 @@ def write_usd(
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         stage.SetTimeCodesPerSecond(fps)
         stage.SetFramesPerSecond(fps)
-        stage.SetStartTimeCode(0)
-        stage.SetEndTimeCode(len(checked[0][1]) - 1)
+        stage.SetStartTimeCode(start)
+        stage.SetEndTimeCode(start + len(checked[0][1]) - 1)
         root = UsdGeom.Xform.Define(stage, "/root")
         stage.SetDefaultPrim(root.GetPrim())
         taken, wardrobe = {"materials"}, Wardrobe(stage, path)
@@ -85,9 +88,9 @@ def write_usd(
             dress(mesh, surface, partial(wardrobe.material, coordinates=coordinates))
             points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
             for frame, positions in enumerate(vertices):
-                points.Set(Vt.Vec3fArray.FromNumpy(positions), frame)
+                points.Set(Vt.Vec3fArray.FromNumpy(positions), start + frame)
                 low, high = positions.min(axis=0), positions.max(axis=0)
-                extent.Set(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]), frame)
+                extent.Set(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]), start + frame)
         if not stage.GetRootLayer().Save():
             raise OutputError(f"{path}: USD could not save it. Is there room on the disk?")
         del stage

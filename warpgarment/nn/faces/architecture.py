@@ -1,4 +1,4 @@
-"""What the program asks of networks of faces, see `nn.architecture.Architecture`."""
+"""The `Architecture` of networks of faces."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from .grow import grow as grown
 from .layout import Sampled, pooled_weights, sampled
 from .network import ManifoldAwareTransformer
 
-MAKING_WEIGHTS = 2.3  # matrices besides the result while geodesic weights are made
-STACKS = (6.0, 4.0)  # copies of the stacked features, while they are prepared and while the network runs
+MAKING_WEIGHTS = 2.3  # number of matrices besides the result while geodesic weights are made
+STACKS = (6.0, 4.0)  # number of copies of the stacked features while they are prepared, and while the network runs
 BAG_ENTRY = 12  # bytes of an entry of a sparse matrix: a column and a weight
 PRESETS = {"base": NetworkConfig.base(), "small": NetworkConfig.small()}
 
 
 class Faces(Architecture):
-    """Every face a token; rows are geodesic weights: a tensor [R,N,N], or `PooledWeights` for large garments."""
+    """Every face is a token. `rows` are geodesic weights: a tensor [R,N,N], or `PooledWeights` for large garments."""
 
     config = NetworkConfig
     presets = PRESETS
@@ -42,13 +42,13 @@ class Faces(Architecture):
         return ManifoldAwareTransformer(config)
 
     def geometry(self, garment: Garment, config: NetworkConfig) -> Any:
-        """Geodesic distances between all faces, or those of pools; None for a network without manifold heads."""
+        """Geodesic distances between all faces, or pooled ones; None for a network without manifold heads."""
         if not config.manifold_heads:
             return None
         return garment.pooled_geodesics if garment.pools else garment.geodesics
 
     def sampled(self, geometry: Any, config: NetworkConfig, device: torch.device) -> Any:
-        """A `Sampled`."""
+        """Kernel or pooled distances on the device, as `Sampled`; None for a network without manifold heads."""
         return None if geometry is None else sampled(geometry, config.geodesic_radius, config.geodesic_power, device)
 
     def rows(
@@ -58,7 +58,7 @@ class Faces(Architecture):
         device: torch.device,
         scale: Sequence[float] | np.ndarray | None = None,
     ) -> Any:
-        """Geodesic weights; sizes can only be scaled of what was `sampled`."""
+        """Geodesic weights; `scale` has an effect only on a `geometry` from `sampled`."""
         first, radius, power = shown[0][0], config.geodesic_radius, config.geodesic_power
         if first is None:
             return torch.zeros((1, 0, 0), device=device)
@@ -74,15 +74,15 @@ class Faces(Architecture):
         return pooled_weights(subsets, radius, power, device)
 
     def entries(self, garment: Garment, faces: int, config: NetworkConfig) -> int:
-        """Of the matrix of all pairs of faces, or of centres of pools."""
+        """Number of pairs of faces, or of centres for pooled distances."""
         return CENTRES**2 if garment.pools else faces**2
 
     def alike(self, garment: Garment) -> Hashable:
-        """Whether its distances are pooled."""
+        """Whether the distances of the garment are pooled."""
         return garment.pools
 
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
-        """Geodesic weights, and on a CPU the distances they are made of; a call of the network."""
+        """Bytes of geodesic weights, of the distances they are made from (on a CPU), and of a call of the network."""
         garments, stack = sizes.garments, 4 * config.history * FEATURES
         weights, largest, network = 0, 0, 0
         for group in row_groups(garments, config, sizes.face_splits):
@@ -108,7 +108,7 @@ class Faces(Architecture):
         }
 
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: Any) -> tuple[int, int]:
-        """As in flops.py, whatever the weights."""
+        """Operations as in flops.py; pooled weights count like a full matrix."""
         heads = 2 * config.embedding * (12 * faces + 3 * components)
         inputs = faces * config.history * config.features + components * 3 * (config.history - 1)
         layers, geodesic = layer_flops(config, faces, components)
@@ -117,12 +117,12 @@ class Faces(Architecture):
     def start_from(
         self, network: GarmentNetwork, config: NetworkConfig, *, grow: bool, seed: int = 0
     ) -> GarmentNetwork:
-        """Grown as in grow.py; else the network itself, in its own shape."""
+        """The network grown as in grow.py; without `grow` the network itself, in its own shape."""
         return grown(network, config, seed=seed) if grow else network
 
 
 def _padded(lengths: Sequence[int], matrices: Iterator[torch.Tensor]) -> torch.Tensor:
-    """Matrices [n,n] as one tensor [R,N,N], zero where padded; made one by one, since all twice could be too much."""
+    """Matrices [n,n] as one tensor [R,N,N], padded with zeros; they come one by one to save memory."""
     first = next(matrices)
     if len(lengths) == 1:
         return first[None]
@@ -133,6 +133,6 @@ def _padded(lengths: Sequence[int], matrices: Iterator[torch.Tensor]) -> torch.T
 
 
 def _distances(garment: Garment) -> int:
-    """Numbers that geodesic weights are made from: of each pair, or between the centres of pools and to them."""
+    """Number of distances from which geodesic weights are made: between all faces, or of `PooledGeodesics`."""
     count = len(garment.faces)
     return CENTRES**2 + 2 * NEAR * count if garment.pools else count**2

@@ -1,16 +1,17 @@
-"""A larger network that predicts what a smaller one does, to go on training from there.
+"""Grows a network: makes a larger one that predicts the same, as a start for further training.
 
     warpgarment train --network base --overrides ... --init small.safetensors --grow ...
 
-Widening and deepening without a change of the function (Chen, Goodfellow and Shlens 2016, "Net2Net"), for the pre-norm
-encoder of network.py:
+The network becomes wider and deeper and stays the same function (Chen, Goodfellow and Shlens 2016, "Net2Net"). For the
+pre-norm encoder layers of attention.py:
 
-- The residual stream is repeated: channel j of the large network holds channel j mod E of the small one. What writes
-  into it has its rows repeated; what reads it shares each weight unevenly among the copies, so that they part ways in
-  training. Layer norm does not notice, since mean and variance stay.
-- New heads, head channels and feed-forward channels start at random, with zeros where they are read. A learned head
-  that becomes wider has its queries scaled by sqrt(new width / old width), which its softmax divides by.
-- New layers write nothing at first, and lie evenly between the old ones.
+- The residual stream is repeated: channel j of the large network holds channel j mod E of the small one. Layers that
+  write to it have their rows repeated. Layers that read it divide each weight unevenly among the copies, so that the
+  copies become different in training. Layer norm gives the same result, since mean and variance stay.
+- New heads, head channels and feed-forward channels have random weights, and zero weights where they are read. The
+  queries of a learned head that becomes wider are scaled by sqrt(new width / old width), since its softmax divides by
+  the square root of the width.
+- New layers add zero to the stream at first. They lie evenly between the old ones.
 """
 
 from __future__ import annotations
@@ -31,20 +32,21 @@ from warpgarment.nn.network import GarmentNetwork
 from .network import ManifoldAwareTransformer
 
 MAY_DIFFER = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "dropout")
-UNEVEN = 0.5  # how far the shares of the copies of a channel are from equal
+UNEVEN = 0.5  # largest relative deviation of a share of a weight from equal shares, for two copies
 
 
 def grow(small: GarmentNetwork, config: NetworkConfig, *, seed: int = 0) -> ManifoldAwareTransformer:
-    """A network of another shape that predicts the same, on the device of the given one.
+    """A larger network that predicts the same as a given one, on its device.
 
     Args:
         small: Network to start from, of faces (`architecture="faces"`); its statistics are kept.
-        config: Shape wanted: an embedding that is a multiple, at least as many layers, feed-forward channels, learned
-            heads and channels of each, and channels of all manifold heads together. `dropout` may differ, nothing else.
-        seed: Of what starts at random.
+        config: The shape wanted. Its embedding is a multiple of the network's. Its numbers of layers, feed-forward
+            channels, learned heads, channels per learned head, and channels of all manifold heads together are at least
+            the network's. `dropout` may differ; all other settings must be equal.
+        seed: Seed for the weights that are initialised at random.
 
     Raises:
-        GrowthError: The network is not one of faces, or the shape cannot be grown to.
+        GrowthError: The network is not one of faces, or cannot be grown to that shape.
     """
     if not isinstance(small, ManifoldAwareTransformer):
         raise GrowthError(
@@ -138,7 +140,7 @@ def _layer(into: EncoderLayer, source: EncoderLayer, old: NetworkConfig, new: Ne
         weight, bias = source.attention.qkv.weight[rows_old], source.attention.qkv.bias[rows_old]
         into.attention.qkv.weight[rows_new][where] = scale.get(name, 1.0) * _shared(weight, copies)
         into.attention.qkv.bias[rows_new][where] = scale.get(name, 1.0) * bias
-        if name == "query" and width[1] > width[0]:  # old heads compare by their old channels alone
+        if name == "query" and width[1] > width[0]:  # the scores of old heads come from their old channels alone
             fresh = torch.ones(rows_new.stop - rows_new.start, dtype=torch.bool)
             fresh[(old.heads - old.manifold_heads) * width[1] :] = False
             fresh[where] = False
@@ -150,7 +152,7 @@ def _layer(into: EncoderLayer, source: EncoderLayer, old: NetworkConfig, new: Ne
 def _head_channels(
     old: NetworkConfig, new: NetworkConfig
 ) -> tuple[dict[str, torch.Tensor], list[tuple[str, slice, slice]]]:
-    """Which channels of the new heads hold the old ones, and the rows of `qkv` of queries, keys and values."""
+    """Channels of the new heads that hold the old ones, and the rows of `qkv` of queries, keys and values."""
     width_old, width_new = old.embedding // old.heads, new.embedding // new.heads
     learned_old, learned_new = ((c.heads - c.manifold_heads) * c.embedding // c.heads for c in (old, new))
     number = torch.arange(learned_old)
@@ -172,7 +174,7 @@ def _norm(into: nn.Module, source: nn.Module, copies: int) -> None:
 
 
 def _shared(weight: torch.Tensor, copies: int) -> torch.Tensor:
-    """Weights [O,E] that read a repeated stream [copies * E] as they read it once: uneven shares that sum to one."""
+    """Weights [O, copies * E] on a repeated stream with the result of [O,E] on one copy; shares sum to one."""
     share = torch.rand(copies, *weight.shape, dtype=weight.dtype) - 0.5
     share = 1.0 / copies + UNEVEN / copies * 2.0 * (share - share.mean(0))
     return (share * weight).transpose(0, 1).reshape(len(weight), -1)

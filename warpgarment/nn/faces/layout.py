@@ -1,10 +1,10 @@
-"""Weights of the manifold heads for large garments, applied without a matrix of F x F.
+"""Geodesic weights of the manifold heads: pooled, without a matrix of F x F for large garments, and for training.
 
     A v  ~  diag(1/s) P K P^T v        K = exp(-(D_c/r)^p) [C,C] between centres, s = P K P^T 1
 
-P and D_c are those of `pooled_geodesics.py`; a subset of faces takes its rows of P, and the sums s of its own. P has a
-few entries in each row: its products are PyTorch's weighted sums of bags of rows, which took a hundredth of the time of
-a Warp kernel with a thread per entry, and a sixth of that of torch.sparse, at 50,000 faces on one CPU core.
+P and D_c are defined in `geometry/pooled_geodesics.py`. A subset of faces takes its rows of P, and its own sums s. P
+has a few entries in each row. Products with it use PyTorch's `embedding_bag`, which took a hundredth of the time of a
+Warp kernel with a thread per entry, and a sixth of the time of torch.sparse, at 50,000 faces on one CPU core.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from warpgarment.geometry.pooled_geodesics import PooledGeodesics
 
 
 class Bags(NamedTuple):
-    """A sparse matrix [M,N] by rows: row i sums `weight` times row `column` of x over start[i] to start[i+1]."""
+    """A sparse matrix [M,N] in CSR form: row i of A x sums weight[k] x[column[k]] over k in start[i]..start[i+1]-1."""
 
     start: torch.Tensor  # int64 [M+1]
     column: torch.Tensor  # int64 [nnz]
@@ -29,14 +29,14 @@ class Bags(NamedTuple):
 
     @classmethod
     def of(cls, matrix: csr_matrix, device: torch.device) -> Bags:
-        """From SciPy."""
+        """Copies a SciPy matrix to a device."""
         start, index = (torch.from_numpy(a.astype(np.int64)).to(device) for a in (matrix.indptr, matrix.indices))
         return cls(start, index, torch.from_numpy(np.ascontiguousarray(matrix.data)).to(device))
 
 
 class _Product(torch.autograd.Function):
-    """y = A x for a constant A; the gradient is A^T dL/dy, gathered row by row too, so that nothing depends on the
-    order in which threads arrive."""
+    """y = A x for a constant A. The gradient A^T dL/dy is also summed row by row, so that the result does not depend on
+    the order of threads."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, *bags: torch.Tensor) -> torch.Tensor:
@@ -51,14 +51,14 @@ class _Product(torch.autograd.Function):
 
 
 def bag_product(x: torch.Tensor, matrix: Bags, transposed: Bags) -> torch.Tensor:
-    """Sparse times dense: x [N,K] -> [M,K], of the weights' type; `transposed` is for the gradient."""
+    """The product A x, [N,K] -> [M,K], with x of the type of the weights; `transposed` is A^T, for the gradient."""
     return _Product.apply(x, *matrix, *transposed)
 
 
 class PooledWeights(NamedTuple):
-    """Weights of R rows of N faces over C centres; stands where `geodesic_weights` [R,N,N] would."""
+    """Weights of R rows of N faces over C centres, in place of a matrix [R,N,N] from `geodesic_weights`."""
 
-    kernel: torch.Tensor  # [R,C,C], or [1,C,C] where all rows are of one garment
+    kernel: torch.Tensor  # [R,C,C], or [1,C,C] if all rows are of one garment
     interpolate: Bags  # P [R*N, R*C]
     collect: Bags  # its transpose
     scale: torch.Tensor  # [R,N], 1/s; 0 where padded
@@ -69,11 +69,11 @@ class PooledWeights(NamedTuple):
         return self.scale.shape[1]
 
     def to(self, dtype: torch.dtype) -> PooledWeights:
-        """Itself: sums over thousands of centres stay in the precision they were made in."""
+        """Returns itself: sums over thousands of centres need the precision in which the weights were made."""
         return self
 
     def spread(self, value: torch.Tensor) -> torch.Tensor:
-        """Weights times values, [R,N,K] -> [R,N,K]; R may be one where the values' is not."""
+        """Weights times values, [R,N,K] -> [R,N,K]; weights of one row apply to all rows of values."""
         rows, faces = self.scale.shape
         if rows == 1 and value.shape[0] > 1:
             batch, _, width = value.shape
@@ -94,14 +94,14 @@ def pooled_weights(
     device: torch.device,
     dtype: torch.dtype = torch.float32,
 ) -> PooledWeights:
-    """Weights of subsets of faces.
+    """Pooled weights of rows of faces.
 
     Args:
-        rows: The garment's distances and the faces of the row, for each.
+        rows: For each row, the pooled distances of its garment and the indices of its faces.
         radius: r [m].
-        power: p.
-        device: Where the tensors go.
-        dtype: Theirs.
+        power: p, without unit.
+        device: Device of the tensors.
+        dtype: Type of the weights.
     """
     faces = max(len(subset) for _, subset in rows)
     centres = max(len(garment.distances) for garment, _ in rows)
@@ -137,9 +137,9 @@ def pooled_weights(
 
 
 class Sampled(NamedTuple):
-    """One garment's geodesics as training keeps them on the device, to draw weights of many subsets of faces from."""
+    """Geodesics of one garment on the device, from which training takes weights of many subsets of faces."""
 
-    # exp(-(D/r)^p), float16 [F,F], of which weights of a subset are rows, divided by their sums; or pooled distances
+    # exp(-(D/r)^p), float16 [F,F]: weights of a subset are its entries, divided by their row sums; or pooled distances
     geodesics: torch.Tensor | PooledGeodesics
     radius: float
     power: float
@@ -151,7 +151,7 @@ class Sampled(NamedTuple):
         return len(self.geodesics) if isinstance(self.geodesics, torch.Tensor) else self.geodesics.faces
 
     def weights(self, faces: np.ndarray, scale: float = 1.0) -> torch.Tensor:
-        """Weights of some faces [n] of the garment made `scale` times as large, float32 [n,n]."""
+        """Weights of some faces [n], float32 [n,n], with all lengths of the garment multiplied by `scale`."""
         if not isinstance(self.geodesics, torch.Tensor):
             return dense_weights(self.geodesics, faces, self.radius / scale, self.power, self.device)
         chosen = torch.from_numpy(faces).to(self.device)
@@ -162,7 +162,7 @@ class Sampled(NamedTuple):
 
 
 def sampled(geometry: np.ndarray | PooledGeodesics, radius: float, power: float, device: torch.device) -> Sampled:
-    """From geodesic distances between all faces [m], float32 [F,F], or from pooled ones."""
+    """Makes a `Sampled` from geodesic distances between all faces [m], float32 [F,F], or from pooled ones."""
     if isinstance(geometry, PooledGeodesics):
         return Sampled(geometry, radius, power, device)
     kernel = torch.exp(-((torch.from_numpy(np.array(geometry)) / radius) ** power))
@@ -172,7 +172,7 @@ def sampled(geometry: np.ndarray | PooledGeodesics, radius: float, power: float,
 def dense_weights(
     garment: PooledGeodesics, subset: np.ndarray, radius: float, power: float, device: torch.device
 ) -> torch.Tensor:
-    """The same for one subset of n faces as a matrix, float32 [n,n]; small next to F x F where n is."""
+    """Pooled weights of one subset of n faces as a matrix, float32 [n,n], for n much smaller than F."""
     count, kernel = len(subset), _kernel(garment, radius, power, device)
     start = np.arange(count + 1) * garment.nearest.shape[1]
     shape = (count, len(kernel))

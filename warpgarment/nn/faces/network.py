@@ -5,7 +5,7 @@
     velocities [C, (H-1)*3]  -> linear -> C tokens --+   (attention.py)      +-> linear -> q (3) per component
 
 History is oldest first: feature k of K in frame h is number h*K + k, and h = H-1 is the newest. There is no positional
-encoding: where a face lies is among its features. What it shares with other networks is in `nn/network.py`.
+encoding: the features of a face include its position. The code shared with other networks is in `nn/network.py`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class ManifoldAwareTransformer(GarmentNetwork):
     """The paper's network: every face is a token.
 
     Args:
-        config: Its shape and settings; `NetworkConfig.base()` and `.small()` are the named ones.
+        config: Shape and settings; `NetworkConfig.base()` and `.small()` are named ones.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -46,21 +46,21 @@ class ManifoldAwareTransformer(GarmentNetwork):
         face_mask: torch.Tensor | None = None,
         component_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
-        """The transformer itself; `rows` are geodesic weights, zero in padded columns."""
+        """The transformer. `rows` are geodesic weights, zero in padded columns."""
         key_mask = None
         if face_mask is not None or component_mask is not None:
             if face_mask is None:
                 face_mask = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
             if component_mask is None:
                 component_mask = torch.ones(v.shape[:2], dtype=torch.bool, device=x.device)
-            x = torch.where(face_mask[..., None], x, 0.0)  # whatever padding holds, NaN too, must not spread
+            x = torch.where(face_mask[..., None], x, 0.0)  # values of padding, even NaN, must not spread
             v = torch.where(component_mask[..., None], v, 0.0)
             key_mask = torch.cat([face_mask, component_mask], dim=1)[:, None, None, :]
         faces, kind = x.shape[1], x.device.type
         half = torch.is_autocast_enabled(kind)
         with torch.autocast(kind, enabled=False):  # velocities are differences of frames that bfloat16 would round away
             tokens = torch.cat([self.embed_faces(x), self.embed_velocity(v)], dim=1)
-        # once, instead of in every layer where autocast runs in half
+        # cast once here, not in every layer, under autocast to half precision
         weights = rows.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
         for layer in self.layers:
             tokens = layer(tokens, weights, key_mask)

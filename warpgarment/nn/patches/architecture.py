@@ -1,11 +1,11 @@
-"""What the program asks of networks of patches, see `nn.architecture.Architecture`.
+"""The `Architecture` of networks of patches.
 
-Operations, with the symbols of `nn/flops.py`: a network of patches has P of them, F face width, G width of a face
-layer, K face layers; its encoder layers are those on P + C tokens, and around them are
+Number of operations, with the symbols of `nn/flops.py`, P patches, faces of width F, face layers of width G, and K face
+layers after the patches: the encoder layers run on P + C tokens, and around them there are
 
     embedding        2 N (34 H) F + 2 C 3 (H - 1) E
-    face layers      (K + 1) 4 N F G + K 2 N F G      pooling and spreading, a few operations a number, are not counted
-    patches          4 P F E + 2 C P F + 2 C F E      to their width and back, and the mean of each component
+    face layers      (K + 1) 4 N F G + K 2 N F G      without pooling and spreading, a few operations per number
+    patches          4 P F E + 2 C P F + 2 C F E      to width E and back, and the mean of each component
     heads            2 N F 12 + 2 C E 3
 """
 
@@ -29,17 +29,17 @@ from warpgarment.objects.garment import Garment
 from .layout import Patches, PatchLayout, garment_patches, patch_layout
 from .network import PatchTransformer
 
-PER_PATCHED_FACE = 120  # bytes: the patches of a face with its shares in them, its neighbours
-STACKS = (1.0, 3.0)  # copies of the stacked features at a time, for a single garment and for several
+PER_PATCHED_FACE = 120  # bytes for the patches of a face, its shares in them, and its neighbours
+STACKS = (1.0, 3.0)  # number of copies of the stacked features at a time, for a single garment and for several
 PRESETS = {"fast": NetworkConfig.fast()}
 
 
 class PatchesOfCloth(Architecture):
-    """Faces pooled into patches; rows are a `PatchLayout`."""
+    """Faces are pooled into patches; `rows` are a `PatchLayout`."""
 
     config = NetworkConfig
     presets = PRESETS
-    subsets = False  # faces hear their neighbours across the edges
+    subsets = False  # faces use their neighbours across the edges
 
     def build(self, config: NetworkConfig) -> GarmentNetwork:
         """An untrained `PatchTransformer`."""
@@ -56,12 +56,12 @@ class PatchesOfCloth(Architecture):
         device: torch.device,
         scale: Sequence[float] | np.ndarray | None = None,
     ) -> PatchLayout:
-        """The patches of some garments, padded."""
+        """The patches of the garments, in padded rows."""
         patches = [whole if faces is None else whole.subset(faces) for whole, faces in shown]
         return patch_layout(patches, config.geodesic_radius, config.geodesic_power, device, scale)
 
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
-        """The patches of all faces, and a call of the network."""
+        """Bytes of the patches of all faces, and of a call of the network."""
         garments, stack = sizes.garments, 4 * config.history * FEATURES
         stacks = (STACKS[len(garments) > 1],) * 2
         layouts, network = 0, 0
@@ -74,7 +74,7 @@ class PatchesOfCloth(Architecture):
         return {"geodesic weights": layouts, "network": network}
 
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: PatchLayout) -> tuple[int, int]:
-        """See above."""
+        """Operations as at the top of this file."""
         e, width, patches = config.embedding, config.face_embedding, rows.start.shape[1]
         embedding = 2 * (width * faces * config.history * config.features + e * components * 3 * (config.history - 1))
         layers, geodesic = layer_flops(config, patches, components)
@@ -85,7 +85,7 @@ class PatchesOfCloth(Architecture):
     def start_from(
         self, network: GarmentNetwork, config: NetworkConfig, *, grow: bool, seed: int = 0
     ) -> GarmentNetwork:
-        """From a network of faces as `PatchTransformer.from_faces` does; from any other, that one in its own shape."""
+        """A network of patches from one of faces, by `PatchTransformer.from_faces`; any other network as it is."""
         if grow:
             raise GrowthError(
                 f"only networks of faces can be grown, and to a shape of faces; this shape has "

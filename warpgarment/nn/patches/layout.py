@@ -1,14 +1,14 @@
-"""Patches of cloth: what a garment's faces are pooled into, along the surface and not through the air.
+"""Patches of cloth, into which the faces of a garment are pooled, by distance along the surface.
 
-Centres are faces chosen farthest point first by geodesic distance, until every face is within `spacing` of one; then
-they are more than `spacing` apart, and every connected piece has at least one. A face belongs to its `SHARES` nearest
-centres c on its own piece, by
+Centres are faces, chosen by farthest point sampling with geodesic distances until every face is within `spacing` of
+one. So they are more than `spacing` apart, and every connected piece has at least one. A face belongs to its `SHARES`
+nearest centres c on its own piece, with the shares
 
     s_fc = softmax_c(-(D_fc / (spacing/2))^2)                sums to 1 over c
 
-and a patch is the mean of its faces by p_cf = s_fc area_f / sum_f s_fc area_f. As the spacing is a length, a garment
-has as many patches however finely it is meshed. All this is done once per garment: one run of Dijkstra's algorithm for
-each centre, nothing of size F x F.
+and a patch is the mean of its faces with weights p_cf = s_fc area_f / sum_f s_fc area_f. As the spacing is a length,
+the number of patches hardly depends on how finely a garment is meshed. Patches are computed once per garment, by one
+run of Dijkstra's algorithm for each centre, without an array of F x F.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from warpgarment.kernels.mesh.laplacian import components
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.objects.garment import Garment
 
-SHARES = 4  # patches a face belongs to
+SHARES = 4  # number of patches to which a face belongs
 
 _known: WeakKeyDictionary[Garment, dict[float, Patches]] = WeakKeyDictionary()
 
@@ -33,20 +33,20 @@ _known: WeakKeyDictionary[Garment, dict[float, Patches]] = WeakKeyDictionary()
 class Patches(NamedTuple):
     """Patches of one garment of F faces."""
 
-    centres: np.ndarray  # int64 [P], faces
+    centres: np.ndarray  # int64 [P], indices of faces
     patch: np.ndarray  # int64 [F, SHARES], nearest first
-    share: np.ndarray  # float32 [F, SHARES], rows sum to one; 0 where a piece has fewer patches
-    member: np.ndarray  # int64 [F * SHARES], faces, those of the first patch first
+    share: np.ndarray  # float32 [F, SHARES], rows sum to one; 0 if a piece has fewer patches
+    member: np.ndarray  # int64 [F * SHARES], indices of faces, sorted by patch
     member_weight: np.ndarray  # float32 [F * SHARES], sums to one over each patch
-    start: np.ndarray  # int64 [P], where each patch's members begin
-    neighbours: np.ndarray | None  # int64 [F,3], faces across the edges, itself at the border; None in a subset
-    distances: np.ndarray  # float32 [P,P], geodesic between centres [m]
+    start: np.ndarray  # int64 [P], position of the first member of each patch
+    neighbours: np.ndarray | None  # int64 [F,3], face across each edge, itself at the border; None in a subset
+    distances: np.ndarray  # float32 [P,P], geodesic distances between centres [m]
     pieces: np.ndarray  # float32 [C,P], share of each patch in the area of each piece, rows sum to one
     piece: np.ndarray  # int64 [P], the piece each patch is on
     area: np.ndarray  # float64 [F], of the faces [m^2]
 
     def subset(self, faces: np.ndarray) -> Patches:
-        """The same patches of some of the faces, int64 [N], which have no neighbours then; patches may be empty."""
+        """The same patches with only some of the faces, int64 [N]; without neighbours, and patches may be empty."""
         patch, share, area = self.patch[faces], self.share[faces], self.area[faces]
         return self._replace(
             patch=patch, share=share, area=area, neighbours=None, **_pools(patch, share, area, self.piece)
@@ -54,8 +54,8 @@ class Patches(NamedTuple):
 
 
 class PatchLayout(NamedTuple):
-    """Patches of a batch of B garments of at most N faces and P patches, as the network wants them; B may be 1 for a
-    batch of one garment many times."""
+    """Patches of a batch of B garments, padded to N faces and P patches. B may be 1 for a batch that repeats one
+    garment."""
 
     patch: torch.Tensor  # int64 [B,N,SHARES]
     share: torch.Tensor  # [B,N,SHARES], 0 where padded
@@ -69,11 +69,11 @@ class PatchLayout(NamedTuple):
 
 
 def garment_patches(garment: Garment, spacing: float) -> Patches:
-    """The patches of a garment, computed the first time, from its geodesic distances where these are there already.
+    """The patches of a garment, computed once and kept; geodesic distances are reused if the garment has them.
 
     Args:
-        garment: Any.
-        spacing: Least distance between centres, and largest from a face to its nearest one [m].
+        garment: The garment.
+        spacing: Least distance between centres, and largest distance from a face to its nearest centre [m].
     """
     mine = _known.setdefault(garment, {})
     if spacing not in mine:
@@ -82,7 +82,7 @@ def garment_patches(garment: Garment, spacing: float) -> Patches:
 
 
 def _distances(garment: Garment) -> Callable[[int], np.ndarray]:
-    """Geodesic distances from a face to all: a row of those that are there already, or else a search."""
+    """A function from a face to its geodesic distances to all faces, known already or found by a search."""
     known = garment.__dict__.get("geodesics")  # a cached property
     if known is not None:
         return known.__getitem__
@@ -96,8 +96,8 @@ def patches(vertices: np.ndarray, faces: np.ndarray, spacing: float, distances: 
     Args:
         vertices: Rest positions [m], shape [V,3].
         faces: Vertex indices, shape [F,3].
-        spacing: As in `garment_patches`.
-        distances: Geodesic distances [m] from a face to all, shape [F]; inf across pieces.
+        spacing: Spacing of the centres [m], as in `garment_patches`.
+        distances: Function that returns the geodesic distances [m] from a face to all, shape [F]; inf across pieces.
     """
     corners = np.asarray(vertices, np.float64)[faces]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -128,7 +128,7 @@ def patches(vertices: np.ndarray, faces: np.ndarray, spacing: float, distances: 
 
 
 def _pools(patch: np.ndarray, share: np.ndarray, area: np.ndarray, piece: np.ndarray) -> dict[str, np.ndarray]:
-    """The fields of `Patches` that say what patches and pieces are means of."""
+    """The fields of `Patches` with the weights of faces in patches, and of patches in pieces."""
     owner, count = patch.ravel(), len(piece)
     order = np.argsort(owner, kind="stable")
     weight = (share * area[:, None]).ravel()
@@ -156,7 +156,7 @@ def _farthest_points(
         face = int(np.argmax(nearest))
         if nearest[face] <= spacing:
             return np.array(centres), np.array(rows)
-        if np.isinf(nearest[face]):  # a piece without a centre: begin at the face farthest from its middle
+        if np.isinf(nearest[face]):  # a piece without a centre: its first one is the face farthest from its middle
             piece = np.isfinite(distances(face))
             out = np.linalg.norm(centroids - centroids[piece].mean(axis=0), axis=1)
             face = int(np.argmax(np.where(piece, out, -1.0)))
@@ -168,7 +168,7 @@ def _farthest_points(
 
 
 def edge_neighbours(faces: np.ndarray) -> np.ndarray:
-    """Face across each edge of a face, the face itself at the border, int64 [F,3]."""
+    """Index of the face across each edge of a face, of the face itself at the border, int64 [F,3]."""
     faces = np.asarray(faces, np.int64)
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     key = ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1]
@@ -187,14 +187,14 @@ def patch_layout(
     device: torch.device | str = "cpu",
     scale: Sequence[float] | np.ndarray | None = None,
 ) -> PatchLayout:
-    """Lays the patches of several garments out in padded rows.
+    """Arranges the patches of several garments in padded rows.
 
     Args:
-        garments: Their patches, one row each.
-        radius: Of the geodesic weights between patches [m], and
-        power: their power, see `attention.geodesic_weights`.
-        device: Where the tensors go.
-        scale: What lengths are multiplied by, one for each garment; None: 1.
+        garments: Patches of each garment, one row each.
+        radius: Radius of the geodesic weights between patches [m], see `attention.geodesic_weights`.
+        power: Power of these weights, without unit.
+        device: Device of the tensors.
+        scale: Factor for the lengths of each garment, shape [B]; None for 1.
     """
     rows, faces = len(garments), max(len(p.patch) for p in garments)
     count = max(len(p.centres) for p in garments)

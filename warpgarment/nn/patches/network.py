@@ -5,11 +5,12 @@
                                                            P patches -> encoder layers -+
     velocities [C, (H-1)*3] -> linear, + linear(mean) --> C tokens  ->  (attention.py) ------------------------> q
 
-The mean is that of the piece of cloth that the velocities are of. `layout.py` says how faces are pooled into patches
-and hear of them again. The encoder layers are those of the manifold-aware transformer, with geodesic distances between
-the patches' centres. A face layer is a small perceptron on each face; those after the patches also see the mean of its
-neighbours across the edges, so that folds much smaller than a patch are kept. At first they do not listen to it, so a
-network may be trained on subsets of faces, which have no neighbours, before it is on whole garments.
+The mean is over the patches of the piece of cloth whose velocity the token is. `layout.py` defines how faces are pooled
+into patches, and how the change of the patches is spread to faces. The encoder layers are those of the manifold-aware
+transformer, with geodesic distances between the centres of patches. A face layer is a small perceptron on each face.
+Face layers after the patches also read the mean of the face's neighbours across the edges, so that folds much smaller
+than a patch are kept. The weights of that mean start at zero, so a network may first be trained on subsets of faces,
+which have no neighbours, and then on whole garments.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class FaceLayer(nn.Module):
         embedding: Width of a face.
         feed_forward: Width of the hidden layer.
         activation: "relu" or "gelu".
-        hears: Whether the hidden layer also sees the mean of the face's neighbours; at first it does not listen.
+        hears: Whether the hidden layer also reads the mean of the face's neighbours, with weights that start at zero.
     """
 
     def __init__(self, embedding: int, feed_forward: int, activation: str, hears: bool) -> None:
@@ -53,7 +54,7 @@ class FaceLayer(nn.Module):
         self.hears = hears
 
     def forward(self, x: torch.Tensor, neighbours: torch.Tensor | None) -> torch.Tensor:
-        """Faces of all garments [F,E] and their neighbours, int64 [F,3], None where there are none -> [F,E]."""
+        """Faces of all garments [F,E] -> [F,E]; `neighbours` are int64 [F,3], or None for subsets of faces."""
         own = self.norm(x)
         hidden = self.expand(own)
         if self.hears:
@@ -63,10 +64,10 @@ class FaceLayer(nn.Module):
 
 
 class PatchTransformer(GarmentNetwork):
-    """Faces, pooled into patches, which attend to each other.
+    """Faces are pooled into patches, which attend to each other.
 
     Args:
-        config: Its shape and settings; `NetworkConfig.fast()` is the named one.
+        config: Shape and settings; `NetworkConfig.fast()` is the named one.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -88,17 +89,18 @@ class PatchTransformer(GarmentNetwork):
 
     @classmethod
     def from_faces(cls, network: ManifoldAwareTransformer, config: NetworkConfig) -> PatchTransformer:
-        """A network of patches that starts from a trained one of faces, for training to go on.
+        """A network of patches made from a trained one of faces, as a start for further training.
 
-        Its layers are done to patches, faces hear how these changed, and face layers do nothing yet. If every face were
-        a patch, it would be the same network.
+        The encoder layers of the given network run on patches, their change is spread to the faces, and face layers add
+        nothing yet. If every face were a patch, it would be the same network.
 
         Args:
-            network: Whose weights and statistics are copied.
-            config: Of the new network, with the same widths (faces as wide as patches), layers, heads and history.
+            network: The network of faces, whose weights and statistics are copied.
+            config: Settings of the new network, with the same widths (faces as wide as patches), layers, heads and
+                history.
 
         Raises:
-            ValueError: They differ, or the network normalises after its layers; says in what.
+            ValueError: These settings differ (the message names them), or the network normalises after its layers.
         """
         old = network.config
         shared = ("embedding", "layers", "feed_forward", "heads", "manifold_heads", "history", "residual", "heading",
@@ -130,7 +132,7 @@ class PatchTransformer(GarmentNetwork):
     def embedded(
         self, face_features: torch.Tensor, turn: torch.Tensor | None, face_mask: torch.Tensor | None
     ) -> torch.Tensor:
-        """What `embed_faces` makes of turned and normalised features, from those as they are.
+        """The result of `embed_faces` for turned and normalised features, computed from features in world space.
 
         W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
         """
@@ -153,7 +155,7 @@ class PatchTransformer(GarmentNetwork):
         face_mask: torch.Tensor | None = None,
         component_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
-        """The network itself; `rows` say how faces lie in patches."""
+        """The network. `rows` assign faces to patches."""
         with torch.autocast(x.device.type, enabled=False):  # differences of frames, which bfloat16 would round away
             faces = self.embed_faces(self._without_padding(x, face_mask))
         return self.forward_embedded(faces, v, rows, face_mask=face_mask, component_mask=component_mask)
@@ -167,14 +169,14 @@ class PatchTransformer(GarmentNetwork):
         face_mask: torch.Tensor | None = None,
         component_mask: torch.Tensor | None = None,
     ) -> NormalisedOutput:
-        """The same from embedded faces [R,N,F]."""
+        """The same as `forward_normalised`, from embedded faces [R,N,F]."""
         with torch.autocast(v.device.type, enabled=False):
             tokens = self.embed_velocity(self._without_padding(v, component_mask))
         return self._from_embeddings(embedded, tokens, rows, component_mask)
 
     @staticmethod
     def _without_padding(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-        """Zero where padded: whatever padding holds, NaN too, must not spread."""
+        """Values with zeros in place of padding, whose values, even NaN, must not spread."""
         return values if mask is None else torch.where(mask[..., None], values, 0.0)
 
     def _from_embeddings(
@@ -232,5 +234,5 @@ class PatchTransformer(GarmentNetwork):
 
 
 def _rows(values: torch.Tensor, batch: int) -> torch.Tensor:
-    """One row for each of the batch, where all share one."""
+    """Expands values of one shared row to all rows of the batch."""
     return values.expand(batch, *values.shape[1:])

@@ -1,4 +1,4 @@
-"""The mean face centroid of each connected component: z of the paper, whose change from frame to frame is q."""
+"""The mean face centroid of each connected component: z in the paper, whose change from frame to frame is q."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Step 5 of a frame: cloth that is too close to something is moved away from it."""
+"""Step 5 of a frame: moves cloth away from a body, or other contact source, to which it is too close."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from warpgarment.kernels.collision.contact_set import (
 )
 from warpgarment.kernels.collision.solver import CollisionSolver
 from warpgarment.kernels.features.carry import carried, face_at_each_vertex
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.bodies import MovingBodies
 from warpgarment.sim.surface import Surface, distance_to_keep
@@ -23,28 +24,32 @@ from warpgarment.sim.timing import Timings
 from .finite import keep_finite
 
 SHALLOW = 1e-4  # metres: collisions are repeated while anything of a garment is deeper
+STRAIGHT = 2
+"""How often, at the end, vertices that are still inside are placed outside without their neighbours."""
+CLEAR = 5e-4
+"""Distance from the surface at which they are placed [m]."""
 
 
 class Contact:
-    """Collision refinement of a batch, repeated for garments of which anything is still deep in a body.
+    """Collision refinement of a batch, repeated for garments that still have a point deep in a body.
 
-    Which garments these are is decided on the device. The others are on no body in a later pass, so their vertices
-    touch nothing and cost next to nothing; the CPU leaves out passes that no garment needs.
+    These garments are selected on the device. In a later pass the others have no body, so their vertices have no
+    contacts and cost little time. On a CPU, passes that no garment needs are left out.
 
     Args:
         packed: The batch.
-        surface: Its edges and faces, of which the depth is measured.
+        surface: Edges and faces of the batch, to measure their depth.
         bodies: The bodies.
         body_of_vertex: Body of each vertex, int32 [V].
         epsilon: Distance that each vertex keeps from the body [m], float32 [V].
-        sources: What finds contacts; the list may grow until the first frame.
+        sources: Objects that find contacts; more may be appended before the first frame.
         passes: Largest number of refinements in a frame; 0 leaves them out.
-        timings: Where the stage adds up how long it took, as "collision".
+        timings: Times of the stages, to which this one adds its own as "collision".
 
     Attributes:
-        early_exit: Whether the host looks after each pass if another is needed. On a GPU it is cheaper to do a pass
-            than to wait for the answer.
-        solver: None where there are no passes.
+        early_exit: Whether the host checks after each pass if another one is needed. On a GPU it does not: a pass takes
+            less time than waiting for that result.
+        solver: Solver of the refinement; None without passes.
     """
 
     def __init__(
@@ -66,10 +71,14 @@ class Contact:
         self.solver = CollisionSolver(packed.rest_vertices, packed.faces) if passes else None
 
     def origin(self, vertices: torch.Tensor, features: torch.Tensor) -> torch.Tensor | None:
-        """Where the vertices at t [V,3], with these features [F,34], would be at t+1 had they moved with the body.
+        """Positions at t+1 of vertices that would move with the body; see `carried`.
+
+        Args:
+            vertices: Garments at t [m], shape [V,3].
+            features: Features at t, shape [F,34].
 
         Returns:
-            Positions [m], shape [V,3], see `carried`; None where there are no passes.
+            Positions [m], shape [V,3]; None without passes.
         """
         if not self._passes:
             return None
@@ -85,19 +94,20 @@ class Contact:
         *,
         measure: bool = True,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Positions at t+1. Differentiable in `vertices` for the contacts that were found.
+        """Positions at t+1 after contact. Differentiable in `vertices`, with the contacts held fixed.
 
         Args:
             vertices: Positions before contact [m], shape [V,3].
             next_body: Bodies at t+1 [m], shape [U,3].
             finite: Which garments are still simulated, bool [B].
-            origin: Where the vertices come from, see `origin`; None: all leave the body by the nearest way.
-            measure: Whether the depth of the result is wanted. Otherwise it is that before the last pass.
+            origin: Positions from which vertices are followed, to find where they entered a body, see `origin`. None
+                moves every vertex out by the shortest way.
+            measure: Whether the depth of the result is measured. Otherwise the depth before the last pass is returned.
 
         Returns:
             Positions [V,3]; finite [B]; depth of the deepest point of each garment in its body [m], shape [B], 0 for
-            garments that are not finite; and the solver's report on all passes: iterations, components stopped by the
-            limit and their largest error, float64 [3].
+            garments that are not finite; and the solver's report on all passes, float64 [3]: iterations, number of
+            components stopped by the limit, and their largest error.
         """
         owner = self._packed.garment_of_vertex.long()
         with self._timings("collision"):
@@ -119,22 +129,50 @@ class Contact:
                 report = _together(report, self.solver.summary())
                 refined = torch.where(pending[owner][:, None], refined, vertices)
                 vertices, finite = keep_finite(self._packed, refined, vertices, finite)
+            if self._sources and self._passes:
+                vertices = self._out(vertices, bodies, pending, origin)
             if measure:
                 inside = self._surface.depth(vertices, bodies, on_body)
                 depth = torch.where(pending, inside.garments, depth)
         return vertices, finite, depth, report
 
+    def _out(
+        self, vertices: torch.Tensor, bodies: BodyMeshes, pending: torch.Tensor, origin: torch.Tensor | None
+    ) -> torch.Tensor:
+        """Places vertices that are still inside after the last pass outside, each by itself.
+
+        Near two parts of a body that are close together or overlap, neighbours pull a vertex from one into the other in
+        each pass.
+
+        Args:
+            vertices: Positions [m], shape [V,3].
+            bodies: The bodies in the same frame.
+            pending: Garments of which anything is inside, bool [B].
+            origin: Where the vertices come from, see `origin`.
+
+        Returns:
+            Positions [m], shape [V,3].
+        """
+        owner = self._packed.garment_of_vertex
+        for _ in range(STRAIGHT):
+            on_body = torch.where(pending[owner.long()], self._body_of_vertex, -1)
+            found = self._contacts(vertices, ContactFrame(bodies, on_body, owner, self._epsilon, origin))
+            missing = (found.normal * (found.anchor - vertices)).sum(1)
+            way = torch.where(missing > 0, missing + CLEAR, 0.0)
+            vertices = (vertices + way[:, None] * found.normal).float()
+        return vertices
+
     def depth(self, vertices: torch.Tensor, body: torch.Tensor) -> torch.Tensor:
-        """How deep each garment is in its body, between its vertices too [m], at least 0; [V,3], [U,3] -> [B]."""
+        """Depth of the deepest point of each garment in its body [m], at least 0; [V,3], [U,3] -> [B]."""
         return self._surface.depth(vertices, self._bodies.at(body), self._body_of_vertex).garments
 
     @torch.no_grad()
     def _contacts(self, vertices: torch.Tensor, frame: ContactFrame) -> Contacts:
-        """One contact at each vertex, of all sources."""
+        """One contact at each vertex: of those that the sources found, the one with the largest gap."""
         found = [one_for_each_vertex(s.find(vertices, frame), f"contact source {s.name!r}") for s in self._sources]
         return nearest(found, vertices)
 
 
 def _together(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Two reports of solves as one: iterations and stopped components add up, of errors the largest counts."""
+    """Joins two reports of solves: sums of iterations and stopped components, and the largest error."""
     return torch.cat([one[:2] + other[:2], torch.maximum(one[2:], other[2:])])

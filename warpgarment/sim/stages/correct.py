@@ -1,4 +1,4 @@
-"""What may change the positions of a frame after contact, such as a few iterations of physics: nothing by itself."""
+"""Correctors, which change positions after contact, such as a few iterations of physics. By default there are none."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from .finite import keep_finite
 
 
 class Corrector(Protocol):
-    """Moves the garments of a batch once more."""
+    """Changes the positions of the garments of a batch after contact."""
 
     name: str
-    """Its row in `Simulator.timings`."""
+    """Name of the corrector, and its key in `Simulator.timings`."""
 
     def __call__(
         self, before: torch.Tensor, after: torch.Tensor, next_body: torch.Tensor, finite: torch.Tensor
     ) -> torch.Tensor:
         """Positions at t+1.
 
-        Frames are recorded as CUDA graphs: nothing here may wait for the device, such as `.item()` or indexing by a
-        mask, and shapes must not change from frame to frame.
+        Frames are recorded as CUDA graphs. So nothing here may wait for the device, as `.item()` and indexing by a mask
+        do, and shapes must not change from frame to frame.
 
         Args:
             before: Garments at t [m], float32 [V,3].
-            after: Garments at t+1 so far [m], float32 [V,3]; not to be changed in place.
+            after: Garments at t+1 after contact and earlier correctors [m], float32 [V,3]; not to be changed in place.
             next_body: Bodies at t+1 [m], float32 [U,3].
             finite: Which garments are simulated, bool [B]; those that are not have stopped, and stay where they are.
 
         Returns:
-            Positions [m], float32 [V,3]. A garment of which they are not finite stops.
+            Positions [m], float32 [V,3]. A garment whose positions are not finite stops.
         """
         ...
 
     def memory(self, sizes: Sizes) -> dict[str, int]:
-        """Bytes that it takes on the device for a batch of these sizes, by what they are for."""
+        """Bytes that it needs on the device for a batch of these sizes, by purpose."""
         ...
 
 
@@ -48,10 +48,10 @@ class Correct:
     """Runs the correctors of a batch one after another.
 
     Args:
-        correctors: The correctors; the list may grow until the first frame.
+        correctors: The correctors; more may be appended before the first frame.
         packed: The batch.
-        depth: Measures how deep garments [V,3] are in bodies [U,3]; [B] in metres.
-        timings: Where each corrector adds up how long it took, by its name.
+        depth: Function that measures the depth of garments [V,3] in bodies [U,3], shape [B], all in metres.
+        timings: Times of the stages, to which each corrector adds its own, by its name.
     """
 
     def __init__(
@@ -71,9 +71,9 @@ class Correct:
         finite: torch.Tensor,
         depth: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Corrected positions [V,3], which garments are finite [B], and how deep they are in their bodies [m], [B].
+        """Corrected positions [V,3], which garments are finite [B], and their depths in the bodies [m], shape [B].
 
-        Without correctors, what was given.
+        Without correctors, the arguments are returned.
 
         Args:
             before: Garments at t [m], shape [V,3].

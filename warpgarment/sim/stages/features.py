@@ -20,7 +20,7 @@ class Features:
         inverse_rest: Inverse rest frames of the faces, see `inverse_rest_frames`, shape [F,3,3].
         body_of_face: Body of each face, int32 [F].
         bodies: The bodies.
-        timings: Where the stage adds up how long it took, as "features".
+        timings: Times of the stages, to which this one adds its own as "features".
     """
 
     def __init__(
@@ -38,8 +38,8 @@ class Features:
     def __call__(self, vertices: torch.Tensor, body: torch.Tensor, next_body: torch.Tensor) -> torch.Tensor:
         """Features of frame t.
 
-        In one launch; or, where the positions require a gradient, operator by operator, with the nearest body face of
-        each face held fixed.
+        One launch computes them. If the positions require a gradient, they are computed operator by operator, with the
+        nearest body face of each face held fixed.
 
         Args:
             vertices: Garments at t [m], shape [V,3].
@@ -68,11 +68,11 @@ class Features:
             )
 
     def of_interaction(self, vertices: torch.Tensor, interaction: BodyInteraction) -> torch.Tensor:
-        """Features of a frame whose nearest body faces are known already.
+        """Features of a frame from nearest body faces that are already known.
 
         Args:
             vertices: Garments [m], shape [V,3].
-            interaction: What `body_interaction` found for the faces.
+            interaction: The result of `body_interaction` for the faces.
 
         Returns:
             Features, shape [F,34].

@@ -1,4 +1,4 @@
-"""Garments that stop being finite keep their last positions, so that they cannot spoil the others of their batch."""
+"""Garments that are not finite keep their last finite positions, so that other garments of the batch stay finite."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def keep_finite(
         packed: The batch.
         new: Positions [m], shape [V,3].
         old: Positions to keep where new ones are not finite [m], shape [V,3].
-        finite: Which garments have been finite so far, bool [B].
+        finite: Whether each garment has been finite so far, bool [B].
 
     Returns:
-        Positions [V,3], and which garments are finite now [B].
+        Positions [m], shape [V,3], and whether each garment is finite now, bool [B].
     """
     owner = packed.garment_of_vertex.long()
     wrong = torch.zeros(packed.count, dtype=torch.int32, device=new.device)

@@ -22,8 +22,8 @@ from warpgarment.sim.timing import Timings
 from .centroids import ComponentCentroids
 from .finite import keep_finite
 
-SMALLEST_SINGULAR_VALUE = 1e-3  # a predicted stretch below this would fold the face onto itself: it becomes this
-PINNED_MEAN = 0.9  # share of the way that q moves a pinned garment from where its pins alone would hold it
+SMALLEST_SINGULAR_VALUE = 1e-3  # least predicted stretch; a smaller one would fold the face onto itself
+PINNED_MEAN = 0.9  # share of the missing mean displacement by which a pinned garment is moved, see `mean_response`
 
 
 class Reconstruct:
@@ -32,12 +32,12 @@ class Reconstruct:
     Args:
         garments: The batch.
         packed: The batch, packed.
-        centroids: Of its components.
+        centroids: Function from positions to the centroids of components.
         first_vertices: Garments in the first frame [m], shape [V,3].
         bodies: The bodies in the first frame, to which pins are tied.
         body_of_garment: Body of each garment, int32 [B].
         replace: Whether the predicted singular values replace those of the predicted deformation gradients.
-        timings: Where the stage adds up how long it took, as "singular values" and "poisson".
+        timings: Times of the stages, to which this one adds its own as "singular values" and "poisson".
     """
 
     def __init__(
@@ -75,10 +75,10 @@ class Reconstruct:
             next_body: Bodies at t+1 [m], shape [U,3].
 
         Returns:
-            Positions [m], shape [V,3], and which garments are finite, bool [B]; the others are where they were.
+            Positions [m], shape [V,3], and which garments are finite, bool [B]; the others keep their positions.
         """
         self._solved = not isinstance(step, VertexStep)
-        if isinstance(step, VertexStep):  # positions are given: they only meet the pins
+        if isinstance(step, VertexStep):  # positions are predicted, and only those of pins change
             positions = step.positions
             if self._pins is not None:
                 positions = positions.index_copy(0, self._packed.pins.long(), self._pins.targets(next_body))
@@ -103,13 +103,13 @@ class Reconstruct:
         return keep_finite(self._packed, solved, vertices, finite)
 
     def summary(self) -> torch.Tensor:
-        """The report of the last Poisson solve, float64 [3] on the device; zeros where none was needed."""
+        """The report of the last Poisson solve, float64 [3] on the device; zeros if positions were predicted."""
         return self.solver.summary() if self._solved else torch.zeros(3, dtype=torch.float64, device=self._device)
 
     def gradients(self, step: Step, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Deformation gradients at t+1 [F,3,3], and whose prediction is finite [B]; see `next_gradients`.
+        """Deformation gradients at t+1 [F,3,3], and garments with finite prediction [B]; see `next_gradients`.
 
-        In two launches; or, where prediction or features require a gradient, operator by operator.
+        Two launches compute them. If prediction or features require a gradient, they are computed operator by operator.
         """
         packed = self._packed
         if step.psi.requires_grad or features.requires_grad:

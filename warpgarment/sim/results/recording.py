@@ -1,4 +1,4 @@
-"""Reading what the host wants to know of a batch's frames."""
+"""Copies the frames of a batch from the device, with their statuses."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 import torch
 
 from warpgarment.objects.status import RolloutStatus
+from warpgarment.sim.frame import Frame
+from warpgarment.sim.scene import Scene
 
-from .scene import Scene
-
-READ_EVERY = 16  # frames of a rollout that a GPU computes before the host looks at them
+READ_EVERY = 16  # number of frames of a rollout that a GPU computes before the host reads them
 
 
 class Outcome(NamedTuple):
-    """A frame as the host sees it."""
+    """One frame on the host."""
 
     parts: list[np.ndarray]  # positions of each garment [V,3]; NaN for one that has failed
     statuses: list[RolloutStatus]
@@ -24,17 +24,23 @@ class Outcome(NamedTuple):
 
 
 def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -> list[Outcome]:
-    """Reads frames from the device, all in one go, and warns of solves that did not converge.
+    """Reads frames from the device in one transfer, and warns of solves that did not converge.
 
     Args:
         scene: The scene that the frames belong to.
         first: Number of the first frame.
-        frames: `Frame.outcome` of this and the following frames.
+        frames: `seen` of this and the following frames.
     """
-    positions, finite, depth, solves = (torch.stack(tensors).cpu().numpy() for tensors in zip(*frames, strict=True))
-    found = []
+    positions, finite, depth, solves, *body = (
+        torch.stack(tensors).cpu().numpy() for tensors in zip(*frames, strict=True)
+    )
+    brought, found = scene.brought, []
     for k in range(len(frames)):
         parts = [part.copy() for part in scene.packed.split(positions[k])]
+        if brought is not None:
+            parts = brought.restored(parts)
+        if brought is not None and body:
+            depth[k] = np.maximum(depth[k], brought.depth(parts, torch.from_numpy(body[0][k]), scene.topology))
         for part, sound in zip(parts, finite[k], strict=True):
             if not sound:
                 part[:] = np.nan
@@ -46,32 +52,39 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
     return found
 
 
+def seen(scene: Scene, frame: Frame) -> tuple[torch.Tensor, ...]:
+    """What `read` reads of a frame: its outcome, and the bodies where vertices are carried that may be inside them."""
+    rides = scene.brought is not None and scene.brought.rides
+    return (*frame.outcome, frame.body) if rides else frame.outcome
+
+
 def _warn_if_stopped(scene: Scene, solves: np.ndarray) -> None:
-    """Warns of solves that stopped at their limit; `solves` [2,3] as in `Frame`, read from the device."""
+    """Warns of solves that stopped at their limit of iterations; `solves` [2,3] is that of `Frame`, on the host."""
     for solver, (_, stopped, error) in zip((scene.reconstruct.solver, scene.contact.solver), solves, strict=True):
         if solver is not None:
             solver.warn_if_stopped(stopped, error)
 
 
 class Recording:
-    """What a rollout keeps of its frames, read from the device some frames at a time.
+    """Positions and statuses of a rollout, read from the device some frames at a time.
 
     Args:
         scene: The scene of the rollout.
-        lengths: Frames of each garment; later ones are not kept, nor what follows a frame that is not finite.
-        every: Frames that are read together.
+        lengths: Number of frames of each garment. Later frames are not kept, nor those after one that is not finite.
+        every: Number of frames that are read together.
     """
 
     def __init__(self, scene: Scene, lengths: Sequence[int], every: int) -> None:
         self.scene, self.lengths, self.every = scene, lengths, every
-        sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, scene.garments, strict=True)]
+        garments = scene.garments if scene.brought is None else scene.brought.garments
+        sizes = [(length, len(garment.vertices), 3) for length, garment in zip(lengths, garments, strict=True)]
         self.positions = [np.full(size, np.nan, np.float32) for size in sizes]
         self.statuses: list[list[RolloutStatus]] = [[] for _ in lengths]
         self._unread: list[tuple[torch.Tensor, ...]] = []
-        self._first = 0  # number of the first frame that was not read
+        self._first = 0  # number of the first frame that has not been read
 
     def add(self, outcome: tuple[torch.Tensor, ...], *, last: bool) -> bool:
-        """Takes the next frame; False once it is known that no garment is finite any more."""
+        """Adds the next frame; returns False if a frame has been read in which no garment is finite."""
         self._unread.append(outcome)
         if len(self._unread) < self.every and not last:
             return True
