@@ -83,3 +83,23 @@ MESHES = {
     "bumpy": lambda: irregular(110, 2, bumps=0.03),
     "sphere": sphere,
 }
+
+
+def tube(radius, length, around, rings):
+    """An open tube with `around` faces' edges a ring."""
+    u, v, faces = sheet(around, rings, wrap=True)
+    turn = u / around * 2 * np.pi
+    return np.stack([radius * np.sin(turn), v / rings * length, radius * np.cos(turn)], axis=1), faces
+
+
+SLENDER = {  # what straps and cords are made of, and sheets of slender faces
+    "drawstring": lambda: tube(0.01, 1.9, 21, 7),
+    "finer drawstring": lambda: tube(0.01, 1.9, 40, 15),
+    "cord with rings": lambda: tube(0.005, 1.0, 6, 60),
+    "cord of slender faces": lambda: tube(0.002, 1.5, 5, 30),
+    "strap": lambda: flat(120, 2, 0.6, 0.02),
+    "sheet, sides 1:20": lambda: flat(60, 3, 0.6, 0.6),
+    "sheet, sides 1:50": lambda: flat(100, 2, 0.6, 0.6),
+    "trouser leg": lambda: tube(0.08, 1.0, 100, 4),
+    "irregular": lambda: tuple(x * ([0.05, 1, 1] if k == 0 else 1) for k, x in enumerate(irregular(350, 4))),
+}
