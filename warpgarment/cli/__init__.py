@@ -63,7 +63,9 @@ VERBS = {
     "bench": Verb("cli.bench", "Bench", "run", "Time a rollout by stage on this machine."),
     "info": Verb("cli.info", "Info", "run", "Say what a file holds: objects, pieces, size, unit, axis, rate, frames."),
     "view": Verb("cli.view", "View", "run", "Look at a motion, or draw it to a PNG or MP4 without a display."),
-    "convert": Verb("cli.convert", "Convert", "run", "Convert a motion between npz, USD, PC2 and folders of OBJ."),
+    "convert": Verb(
+        "cli.convert", "Convert", "run", "Convert a motion between npz, USD, glTF, PC2 and folders of OBJ."
+    ),
     "doctor": Verb("cli.doctor", "Doctor", "run", "Versions, devices, installed extras, and a quick self check."),
 }
 

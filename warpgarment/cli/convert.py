@@ -21,9 +21,10 @@ class Convert:
     """Options of `convert`."""
 
     input: tyro.conf.Positional[Path]
-    """Motion to read: .npz, .usd, .pc2 (with its .obj beside it), or a folder of .obj."""
+    """Motion to read: .npz, .usd, .glb, .pc2 (with its .obj beside it), or a folder of .obj."""
     output: tyro.conf.Positional[Output]
-    """Motion to write: .npz, .usd (.usda, .usdc), .pc2, or a folder of .obj."""
+    """Motion to write: .npz, .usd (.usda, .usdc), .glb, .pc2, or a folder of .obj. Polygons, UVs, materials and groups
+    stay, as far as the format has them."""
     fps: float | None = None
     """Resample to this rate; by default the rate stays. The motion begins and ends when it did."""
     input_fps: float | None = None
@@ -50,6 +51,6 @@ def run(options: Convert) -> None:
         )
     if options.fps is not None:
         motion = motion.resampled(options.fps)
-    with spoken(fps="--fps"):
+    with spoken(fps="--fps", output="OUTPUT"):
         motion.save(options.output)
     print(f"{options.output}: {in_words(motion.clock)}, {motion.vertices.shape[1]} vertices")

@@ -31,9 +31,10 @@ class Simulate:
     garment: tyro.conf.Positional[Path]
     """Rest mesh of the garment, draped on the body's first frame (or see --fit-rest): .obj, .ply, .glb, .usd, .npz."""
     body: tyro.conf.Positional[Path]
-    """Body motion: .npz, .usd, .pc2 with its .obj beside it, or a folder of .obj."""
+    """Body motion: .npz, .usd, .glb, .pc2 with its .obj beside it, or a folder of .obj."""
     out: Output
-    """Where to write: .usd, .pc2, .npz, or a folder of .obj (no suffix)."""
+    """Where to write: .usd, .glb, .pc2, .npz, or a folder of .obj (no suffix). Polygons, UVs, materials and groups of
+    the garment's file stay; glTF has triangles only, and normals are left to whoever shows the result."""
     weights: str = "default"
     """Network: a name that ships with the package, or a checkpoint file or folder."""
     device: str | None = None
@@ -93,6 +94,7 @@ def run(options: Simulate) -> None:
         frames = body.clock.resampled(fps, options.frames)[0].frames
         check_space(options.out, len(garment.vertices) * frames * 12)
         motion = simulator.rollout(garment, body, **known, progress=sys.stderr.isatty())
+    with spoken(out="--out"):
         motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))

@@ -10,6 +10,7 @@ from typing import Any
 import tyro
 
 from warpgarment.errors import MissingExtra, UsageError
+from warpgarment.io.files import whole_output
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.clock import in_words
 from warpgarment.objects.motion import GarmentMotion
@@ -27,7 +28,7 @@ class View:
     """Options of `view`."""
 
     motion: tyro.conf.Positional[tuple[Path, ...]]
-    """Garment motions: .npz, .usd, .pc2 with its .obj beside it, or folders of .obj."""
+    """Garment motions: .npz, .usd, .glb, .pc2 with its .obj beside it, or folders of .obj."""
     mesh: str | None = None
     """Name of the mesh to read where the motions' files hold several."""
     fps: float | None = None
@@ -61,7 +62,10 @@ def run(options: View) -> None:
         check_output(options.out, (".png", ".mp4"))
     _check_picture(options)
     with spoken(mesh="--mesh", fps="--fps"):
-        loaded = [BodyMotion.load(path, mesh=options.mesh, fps=options.fps, collider=False) for path in options.motion]
+        loaded = [
+            BodyMotion.load(path, mesh=whole_output(path, options.mesh), fps=options.fps, collider=False)
+            for path in options.motion
+        ]
     garments = [_garment(m, p.stem, options.start) for m, p in zip(loaded, options.motion, strict=True)]
     body = None
     if options.body is not None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from warpgarment.errors import UsageError
+from warpgarment.io.surface.record import Surface
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
@@ -21,12 +22,15 @@ class MeshData(NamedTuple):
         faces: Vertex indices, counter-clockwise seen from outside, shape [F,3].
         pins: Vertex indices, shape [P], in formats that keep them.
         name: Of the mesh inside the file; empty where it has none.
+        surface: Its polygons, texture coordinates and materials; None: nothing that the triangles do not say. Where
+            there is one, `faces` are its polygons as `triangulate_counts` cuts them.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     pins: np.ndarray | None = None
     name: str = ""
+    surface: Surface | None = None
 
 
 class MotionData(NamedTuple):
@@ -43,6 +47,7 @@ class MotionData(NamedTuple):
         start: Number of the first frame, in steps, counted from time 0; None where the file does not say.
         seconds: Time of the first frame [s], where the file says that in place of a number, or besides.
         last: When the last frame is reached, in frames after the first, where that is not T - 1.
+        surface: As of `MeshData`.
     """
 
     vertices: np.ndarray
@@ -55,6 +60,7 @@ class MotionData(NamedTuple):
     start: float | None = None
     seconds: float | None = None
     last: float | None = None
+    surface: Surface | None = None
 
     @classmethod
     def of(cls, vertices: np.ndarray, faces: np.ndarray, clock: Any, **more: Any) -> MotionData:

@@ -16,7 +16,7 @@ from warpgarment.io.disk.outputs import names_folder
 from warpgarment.io.disk.plain import check_plain
 
 from .data import UNITS, Format, MeshData, MotionData, ReadOptions, scale_of
-from .parts import unnamed
+from .parts import ALL, unnamed
 
 # Suffixes -> the module whose FORMAT reads and writes them; "" is a folder. docs/extending.md adds one.
 FORMATS: dict[tuple[str, ...], str] = {
@@ -113,11 +113,19 @@ def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None,
     else:
         assert format.read_mesh is not None
         single = format.read_mesh(path, options)
-        data = MotionData(np.asarray(single.vertices)[None], single.faces, name=single.name)
+        data = MotionData(np.asarray(single.vertices)[None], single.faces, name=single.name, surface=single.surface)
     data = data._replace(vertices=_placed(data.vertices, scale, up))
     if up is None and not format.axis:
         _warn_about_axis(path, np.asarray(data.vertices))
     return data
+
+
+def whole_output(path: Path, mesh: str | None) -> str | None:
+    """The name to read a result by: all objects of a folder of OBJ or a point cache, where none is named.
+
+    What `write_motion` writes is one mesh, and keeps the names of the objects that its input was made of.
+    """
+    return ALL if mesh is None and (path.is_dir() or path.suffix.lower() == ".pc2") else mesh
 
 
 def rate_of(path: Path, data: MotionData, fps: float | None) -> float:

@@ -11,12 +11,16 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_folder
+from warpgarment.io.surface.mtl import mtl_text
+from warpgarment.io.surface.obj import OBJ_KEEPS, has_materials, text_around
+from warpgarment.io.surface.record import of_triangles, say_left_out
 
 from .data import Format, Holds, MotionData, ReadOptions
-from .obj import chosen_polygons, obj_holds, obj_text, read_polygons
+from .obj import chosen_polygons, obj_holds, obj_text, read_polygons, surface_of
 from .polygons import triangulate_counts
 
-FRAME = "frame_*.obj"
+LIBRARY = "materials.mtl"
+FRAME = ("frame_*.obj", LIBRARY)
 LONGEST = 10_000  # frames that are missing in a row
 
 
@@ -40,7 +44,7 @@ def read_folder(path: Path, options: ReadOptions) -> MotionData:
     used, _, counts, corners = chosen_polygons(files[0], first, options.mesh)
     frames = [first.vertices[used]]
     for file in files[1:]:
-        found = read_polygons(file)
+        found = read_polygons(file, dressed=False)
         same = np.array_equal(found.counts, first.counts) and np.array_equal(found.corners, first.corners)
         if found.vertices.shape != first.vertices.shape or not same:
             raise MeshError(
@@ -55,10 +59,11 @@ def read_folder(path: Path, options: ReadOptions) -> MotionData:
         raise MeshError(f"{files[0]}: {error}") from None
     told = _numbers(files)
     numbers = told if told is not None else list(range(len(files)))
+    surface = surface_of(files[0], first, options.mesh, used)
     step, vertices = _spread(path, numbers, np.stack(frames))
     with np.errstate(over="ignore"):
         start = numbers[0] / step if told is not None else None
-        return MotionData(vertices.astype(np.float32), faces, step=step, start=start)
+        return MotionData(vertices.astype(np.float32), faces, step=step, start=start, surface=surface)
 
 
 def _numbers(files: list[Path]) -> list[int] | None:
@@ -102,12 +107,12 @@ def _spread(path: Path, numbers: list[int], frames: np.ndarray) -> tuple[int, np
 
 
 def write_folder(path: Path, data: MotionData) -> None:
-    """Writes frame_1001.obj, frame_1002.obj, ... from the number of the first frame on.
+    """Writes frame_1001.obj, frame_1002.obj, ... from the number of the first frame on, and materials.mtl.
 
-    A folder that holds nothing else is replaced.
+    The latter only where there are materials. A folder that holds nothing else is replaced.
 
     Warns:
-        UserWarning: The first frame lies between two numbers, or before 0.
+        UserWarning: The first frame lies between two numbers, or before 0; or OBJ cannot hold all of the surface.
     """
     begins = data.start or 0.0
     first = max(round(begins), 0)
@@ -118,10 +123,15 @@ def write_folder(path: Path, data: MotionData) -> None:
             UserWarning,
             stacklevel=4,
         )
+    say_left_out(path, data.surface, sets=1, keeps=OBJ_KEEPS)
     digits = max(4, len(str(first + len(data.vertices) - 1)))
+    library = LIBRARY if has_materials(data.surface) else ""
+    around = text_around(data.surface or of_triangles(data.faces), data.name, library)
     with atomic_folder(path, FRAME) as folder:
+        if library and data.surface is not None:
+            (folder / library).write_text(mtl_text(data.surface, path), encoding="utf-8")
         for frame, positions in enumerate(data.vertices, first):
-            text = obj_text(positions, data.faces, data.name)
+            text = obj_text(positions, data.faces, data.name, around)
             (folder / f"frame_{frame:0{digits}d}.obj").write_text(text, encoding="utf-8")
 
 

@@ -17,6 +17,8 @@ from warpgarment.errors import MeshError
 from warpgarment.geometry.skinning import linear_blend_skinning
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.plain import open_plain
+from warpgarment.io.surface.arrays import PREFIX, from_arrays, to_arrays
+from warpgarment.io.surface.record import Surface, worth_keeping
 
 from .data import Format, MeshData, MotionData, ReadOptions
 from .parts import ALL, Parts, named
@@ -122,16 +124,19 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
-    arrays = read_npz(path, ("vertices", "faces"), {"vertices", "faces", "pins", "name"}.__contains__)
+    known = {"vertices", "faces", "pins", "name"}
+    arrays = read_npz(path, ("vertices", "faces"), lambda key: key in known or key.startswith(PREFIX))
     _check_name(path, arrays, options.mesh)
-    return MeshData(arrays["vertices"], arrays["faces"], arrays.get("pins"), _name(arrays))
+    return MeshData(arrays["vertices"], arrays["faces"], arrays.get("pins"), _name(arrays), _surface(path, arrays))
 
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     """Positions, or a rest mesh with bones that move it."""
     known = {"vertices", "collider_faces", *TIMES, *SKINNED}
     arrays = read_npz(
-        path, ("faces",), lambda key: key in known or key == "name" or key.startswith("status_") or _is_rate(key)
+        path,
+        ("faces",),
+        lambda key: key in known or key == "name" or key.startswith(("status_", PREFIX)) or _is_rate(key),
     )
     if "vertices" in arrays:
         vertices = arrays["vertices"]
@@ -152,9 +157,20 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     for key, value in zip(TIMES, (seconds, start, last), strict=True):
         if value is not None and not math.isfinite(value):
             raise MeshError(f"{path}: {key} must be finite, not {value}.")
-    extra = {key: array for key, array in arrays.items() if key not in known and not _is_rate(key)}
+    others = {key for key in arrays if key in known or _is_rate(key) or key.startswith(PREFIX)}
+    extra = {key: array for key, array in arrays.items() if key not in others}
     whole = MotionData(vertices, arrays["faces"], fps, arrays.get("collider_faces"), _name(arrays), extra)
-    return whole._replace(start=start, seconds=seconds, last=last)
+    return whole._replace(start=start, seconds=seconds, last=last, surface=_surface(path, arrays))
+
+
+def _surface(path: Path, arrays: Mapping[str, np.ndarray]) -> Surface | None:
+    def make() -> Surface | None:
+        found = from_arrays(arrays)
+        if found is not None:
+            found.check_vertices(arrays["vertices"].shape[-2])
+        return found
+
+    return worth_keeping(path, make)
 
 
 def _is_rate(key: str) -> bool:
@@ -190,13 +206,23 @@ def _name(arrays: Mapping[str, np.ndarray]) -> str:
 
 def _write_mesh(path: Path, data: MeshData) -> None:
     pins = {} if data.pins is None or len(data.pins) == 0 else {"pins": data.pins}
-    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **pins})
+    write_npz(
+        path,
+        {
+            "vertices": data.vertices,
+            "faces": data.faces,
+            "name": np.array(data.name),
+            **pins,
+            **to_arrays(data.surface),
+        },
+    )
 
 
 def _write_motion(path: Path, data: MotionData) -> None:
     times = {"fps": data.fps, "start": data.seconds, "last": data.last}
     told = {key: np.array(value, dtype=np.float64) for key, value in times.items() if value is not None}
-    write_npz(path, {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **told, **data.extra})
+    arrays = {"vertices": data.vertices, "faces": data.faces, "name": np.array(data.name), **told, **data.extra}
+    write_npz(path, arrays | to_arrays(data.surface))
 
 
 FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True)

@@ -9,14 +9,17 @@ from __future__ import annotations
 import codecs
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.disk.atomic import atomic_files
 from warpgarment.io.disk.plain import read_plain
+from warpgarment.io.surface.obj import OBJ_KEEPS, Around, Looks, obj_files, text_around, without_unused
+from warpgarment.io.surface.record import Labels, Surface, of_triangles, say_left_out, worth_keeping
 
 from .data import Format, Holds, MeshData, ReadOptions
 from .parts import ALL, Parts, connected_pieces, listed, named, unconnected, used_only
@@ -34,6 +37,7 @@ class ObjMesh(NamedTuple):
         corners: Vertices of the corners, end to end.
         objects: By the `o` line above each polygon.
         groups: By the `g` line above each polygon.
+        looks: Texture coordinates and materials.
     """
 
     vertices: np.ndarray
@@ -41,6 +45,7 @@ class ObjMesh(NamedTuple):
     corners: np.ndarray
     objects: Parts
     groups: Parts
+    looks: Looks
 
 
 def read_obj(path: Path, mesh: str | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -64,9 +69,15 @@ def read_obj(path: Path, mesh: str | None = None) -> tuple[np.ndarray, np.ndarra
     Warns:
         UserWarning: Several groups that are not connected, and none was named.
     """
-    vertices, counts, corners = chosen_polygons(path, read_polygons(path), mesh)[1:]
+    found = _mesh(path, read_polygons(path), mesh)
+    return found.vertices, found.faces
+
+
+def _mesh(path: Path, found: ObjMesh, mesh: str | None) -> MeshData:
+    used, vertices, counts, corners = chosen_polygons(path, found, mesh)
+    faces = _triangles(path, vertices, counts, corners)
     with np.errstate(over="ignore"):
-        return vertices.astype(np.float32), _triangles(path, vertices, counts, corners)
+        return MeshData(vertices.astype(np.float32), faces, surface=surface_of(path, found, mesh, used))
 
 
 def _triangles(path: Path, vertices: np.ndarray, counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -105,8 +116,22 @@ def chosen_polygons(
     return used, found.vertices[used], found.counts[polygons], corners
 
 
-def read_polygons(path: Path) -> ObjMesh:
-    """An OBJ file as it is; raises as `read_obj`."""
+def surface_of(path: Path, found: ObjMesh, mesh: str | None, used: np.ndarray) -> Surface | None:
+    """The surface of the part that `chosen_polygons` has chosen, whose vertices in the file are `used`."""
+
+    def make() -> Surface:
+        objects, groups = (Labels(tuple(p.names)[1:], p.of_polygon - 1) for p in (found.objects, found.groups))
+        whole = found.looks.surface(path, found.counts, found.corners, objects, groups)
+        if mesh in (None, ALL):
+            return without_unused(whole)
+        part = whole.only(named(path, str(mesh), found.objects, found.groups))
+        return without_unused(replace(part, corners=np.searchsorted(used, part.corners)))
+
+    return worth_keeping(path, make)
+
+
+def read_polygons(path: Path, *, dressed: bool = True) -> ObjMesh:
+    """An OBJ file as it is, or without its looks; raises as `read_obj`."""
     vertices: list[list[float]] = []
     counts: list[int] = []
     corners: list[int] = []
@@ -114,6 +139,7 @@ def read_polygons(path: Path) -> ObjMesh:
     of_object: list[int] = []
     of_group: list[int] = []
     name = group = 0
+    looks = Looks()
     for number, line in _lines(path):
         words = line.split()
         try:
@@ -127,10 +153,14 @@ def read_polygons(path: Path) -> ObjMesh:
                 counts.append(len(words) - 1)
                 of_object.append(name)
                 of_group.append(group)
+                if dressed:
+                    looks.face(words[1:])
             elif words[0] == "o":
                 name = objects.setdefault(" ".join(words[1:]), len(objects))
             elif words[0] == "g":
                 group = groups.setdefault(" ".join(words[1:]), len(groups))
+            elif dressed:
+                looks.line(number, line)
         except ValueError as error:
             raise MeshError(f"{path}, line {number}: {error}. The file is damaged or cut short.") from None
     if not vertices or not counts:
@@ -145,7 +175,7 @@ def read_polygons(path: Path) -> ObjMesh:
         )
     named_objects = Parts(list(objects), np.array(of_object))
     named_groups = Parts(list(groups), np.array(of_group), several=True)
-    return ObjMesh(np.array(vertices, dtype=np.float64), np.array(counts), indices, named_objects, named_groups)
+    return ObjMesh(np.array(vertices, dtype=np.float64), np.array(counts), indices, named_objects, named_groups, looks)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -183,12 +213,16 @@ def _corners(words: list[str], count: int) -> list[int]:
     return corners
 
 
-def obj_text(vertices: np.ndarray, faces: np.ndarray, name: str = "") -> str:
-    """An OBJ file's text; nine digits give every float32 back."""
-    lines = [f"o {name.split()[0]}"] if name.split() else []
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces.tolist()]
-    return "\n".join(lines) + "\n"
+def obj_text(vertices: np.ndarray, faces: np.ndarray, name: str = "", around: Around | None = None) -> str:
+    """An OBJ file's text.
+
+    Args:
+        vertices: Positions [V,3].
+        faces: Triangles [F,3].
+        name: Of the object.
+        around: What to write beside the vertices instead of the triangles and the name.
+    """
+    return (around or text_around(of_triangles(faces), name)).of(vertices)
 
 
 def obj_holds(path: Path) -> Holds:
@@ -208,12 +242,15 @@ def obj_holds(path: Path) -> Holds:
 
 
 def _read(path: Path, options: ReadOptions) -> MeshData:
-    return MeshData(*read_obj(path, options.mesh))
+    return _mesh(path, read_polygons(path), options.mesh)
 
 
 def _write(path: Path, data: MeshData) -> None:
-    with atomic_file(path) as temporary:
-        temporary.write_text(obj_text(data.vertices, data.faces, data.name), encoding="utf-8")
+    say_left_out(path, data.surface, sets=1, keeps=OBJ_KEEPS)
+    texts = obj_files(path, data.vertices, data.faces, data.name, data.surface)
+    with atomic_files(*texts) as temporary:
+        for file, text in zip(temporary, texts.values(), strict=True):
+            file.write_text(text, encoding="utf-8")
 
 
 FORMAT = Format(read_mesh=_read, write_mesh=_write, named=True, holds=obj_holds)

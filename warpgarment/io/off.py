@@ -8,6 +8,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.plain import read_plain
+from warpgarment.io.surface.record import Surface, worth_keeping
 
 from .data import Format, MeshData, ReadOptions
 from .polygons import triangulate_counts
@@ -15,8 +16,8 @@ from .polygons import triangulate_counts
 HEADERS = ("OFF", "COFF", "NOFF", "CNOFF", "STOFF")  # rows of vertices begin with positions in all of them
 
 
-def read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices float32 [V,3] in the file's unit, and faces int64 [F,3], polygons as triangles.
+def read_off(path: Path) -> MeshData:
+    """The mesh, its vertices in the file's unit.
 
     Raises:
         MeshError: Not an OFF file in text form, cut short, or a face names a vertex that does not exist.
@@ -43,7 +44,8 @@ def read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
         if corners.min() < 0 or corners.max() >= count:
             raise ValueError(f"a face names a vertex beyond the {count:,}")
         with np.errstate(over="ignore"):
-            return vertices.astype(np.float32), triangulate_counts(vertices, counts, corners)
+            rest, triangles = vertices.astype(np.float32), triangulate_counts(vertices, counts, corners)
+        return MeshData(rest, triangles, surface=worth_keeping(path, lambda: Surface(counts, corners)))
     except (ValueError, IndexError, OverflowError) as error:
         raise MeshError(
             f"{path}: not a readable OFF file ({str(error)[:100]}). It is damaged, cut short, or of another kind."
@@ -51,7 +53,7 @@ def read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read(path: Path, options: ReadOptions) -> MeshData:
-    return MeshData(*read_off(path))
+    return read_off(path)
 
 
 FORMAT = Format(read_mesh=_read)

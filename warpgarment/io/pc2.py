@@ -17,9 +17,11 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_files
 from warpgarment.io.disk.plain import open_plain
+from warpgarment.io.surface.obj import OBJ_KEEPS, obj_files
+from warpgarment.io.surface.record import say_left_out
 
 from .data import Format, Holds, MotionData, ReadOptions
-from .obj import chosen_polygons, obj_holds, obj_text, read_polygons
+from .obj import chosen_polygons, obj_holds, read_polygons, surface_of
 from .parts import unnamed
 from .ply import read_ply
 from .polygons import triangulate_counts
@@ -96,17 +98,19 @@ def _read(path: Path, options: ReadOptions) -> MotionData:
     cache = read_pc2(path)
     if mesh.suffix.lower() == ".ply":
         unnamed(path, options.mesh)
-        rest, faces = read_ply(mesh)
+        ply = read_ply(mesh)
+        rest, faces, surface = ply.vertices, ply.faces, ply.surface
         count, used = len(rest), np.arange(len(rest))
     else:
         found = read_polygons(mesh)
         used, rest, counts, corners = chosen_polygons(mesh, found, options.mesh)
         count, faces = len(found.vertices), triangulate_counts(rest, counts, corners)
+        surface = surface_of(mesh, found, options.mesh, used)
     if count != cache.vertices.shape[1]:
         raise MeshError(f"{path} has {cache.vertices.shape[1]:,} points and {mesh.name} {count:,} vertices.")
     vertices = cache.vertices[:, used]
     _warn_about_order(path, mesh, rest, vertices[0], faces)
-    return MotionData(vertices, faces, step=cache.sampling, start=cache.start / cache.sampling)
+    return MotionData(vertices, faces, step=cache.sampling, start=cache.start / cache.sampling, surface=surface)
 
 
 def _warn_about_order(path: Path, mesh: Path, rest: np.ndarray, first: np.ndarray, faces: np.ndarray) -> None:
@@ -133,9 +137,12 @@ def _warn_about_order(path: Path, mesh: Path, rest: np.ndarray, first: np.ndarra
 
 
 def _write(path: Path, data: MotionData) -> None:
-    """The cache, and its first frame as .obj of the same name beside it."""
-    with atomic_files(path.with_suffix(".obj"), path) as (mesh, cache):
-        mesh.write_text(obj_text(data.vertices[0], data.faces, data.name), encoding="utf-8")
+    """The cache, and its first frame as .obj of the same name beside it, which holds what a cache cannot."""
+    say_left_out(path, data.surface, sets=1, keeps=OBJ_KEEPS)
+    texts = obj_files(path.with_suffix(".obj"), data.vertices[0], data.faces, data.name, data.surface)
+    with atomic_files(*texts, path) as (*files, cache):
+        for file, text in zip(files, texts.values(), strict=True):
+            file.write_text(text, encoding="utf-8")
         write_pc2_to(cache, data.vertices, start=data.start or 0.0)
 
 

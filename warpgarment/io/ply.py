@@ -10,6 +10,7 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.plain import read_plain
+from warpgarment.io.surface.record import NONE, Coordinates, Surface, say_left_out, worth_keeping
 
 from .data import Format, MeshData, ReadOptions
 from .polygons import triangulate_counts
@@ -26,6 +27,7 @@ TYPES = {
 }
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 CORNERS = ("vertex_indices", "vertex_index")
+TEXTURE = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 Table: TypeAlias = "dict[str, np.ndarray | tuple[np.ndarray, np.ndarray]]"  # numbers; lists: lengths, values end to end
 _NONE = np.zeros(0, dtype=np.int64)
 
@@ -38,14 +40,14 @@ class _Element:
         self.properties: list[tuple[str, str, str | None]] = []
 
 
-def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a PLY file; other elements and properties (normals, texture, colour) are skipped.
+def read_ply(path: Path) -> MeshData:
+    """The mesh of a PLY file, with texture coordinates of vertices or of corners; normals and colours are skipped.
 
     Args:
         path: The file.
 
     Returns:
-        Vertices float32 [V,3] in the file's unit, faces int64 [F,3].
+        Vertices float32 [V,3] in the file's unit, faces int64 [F,3], and the surface where it says more.
 
     Raises:
         MeshError: Not a PLY file, cut short, or a face names a vertex that does not exist.
@@ -64,8 +66,26 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: not a readable PLY mesh ({type(error).__name__}: {error}). "
             "It is damaged, cut short, or of another kind."
         ) from None
+    surface = worth_keeping(path, lambda: Surface(counts, indices, _coordinates(tables, counts, indices)))
     with np.errstate(over="ignore"):
-        return vertices.astype(np.float32), faces
+        return MeshData(vertices.astype(np.float32), faces, surface=surface)
+
+
+def _coordinates(tables: dict[str, Table], counts: np.ndarray, corners: np.ndarray) -> tuple[Coordinates, ...]:
+    """Texture coordinates: of corners, a list of as many pairs as a face has corners, else of vertices."""
+    wedges = tables["face"].get("texcoord")
+    if isinstance(wedges, tuple):
+        lengths, values = wedges
+        if ((lengths != 2 * counts) & (lengths != 0)).any():
+            raise ValueError("lists of texture coordinates that are not two numbers a corner")
+        places = np.full(len(corners), NONE)
+        has = np.repeat(lengths > 0, counts)
+        places[has] = np.arange(np.count_nonzero(has))
+        return (Coordinates("", values.reshape(-1, 2), places),) if has.any() else ()
+    for u, v in TEXTURE:
+        if u in tables["vertex"] and v in tables["vertex"]:
+            return (Coordinates("", np.stack([_numbers(tables["vertex"], axis) for axis in (u, v)], axis=1), corners),)
+    return ()
 
 
 def _numbers(table: Table, name: str) -> np.ndarray:
@@ -253,11 +273,13 @@ class _Ascii(_Source):
 
 
 def _read(path: Path, options: ReadOptions) -> MeshData:
-    return MeshData(*read_ply(path))
+    return read_ply(path)
 
 
 def _write(path: Path, data: MeshData) -> None:
     import trimesh
+
+    say_left_out(path, data.surface, polygons="polygons became triangles")
 
     content = cast(bytes, trimesh.Trimesh(data.vertices, data.faces, process=False).export(file_type="ply"))
     with atomic_file(path) as temporary:

@@ -21,6 +21,7 @@ from warpgarment.geometry.checks import (
     to_numpy,
 )
 from warpgarment.geometry.orientation import turned_outward
+from warpgarment.io.surface.record import Surface
 
 from .clock import Clock, between
 
@@ -43,6 +44,8 @@ class BodyMotion:
         last: When the last frame is reached, in frames after the first: T - 1, or less where resampling put the end of
             the motion on a frame that comes a little later. See `Clock`.
         source: How its file was read (`warpgarment.io.source.Source`); None for a motion made of arrays.
+        surface: Polygons, texture coordinates, materials and groups of the file it was loaded from, for `save`; None:
+            triangles alone. They are lost where faces are left out.
 
     Args:
         vertices: Positions [m], shape [T,V,3]; NumPy, torch or nested lists.
@@ -60,6 +63,7 @@ class BodyMotion:
     """
 
     source: Source | None = None
+    surface: Surface | None = None
 
     def __init__(self, vertices: Any, faces: Any, fps: float = 30.0, *, start: float = 0.0, last: float | None = None):
         self.vertices = checked_positions(vertices, frames=True)
@@ -78,11 +82,14 @@ class BodyMotion:
         self.faces = turned_outward(self.vertices[0], self.faces, "the body")
 
     @classmethod
-    def _derived(cls, vertices: np.ndarray, faces: np.ndarray, clock: Clock, degenerate_faces: int) -> BodyMotion:
+    def _derived(
+        cls, vertices: np.ndarray, faces: np.ndarray, clock: Clock, degenerate_faces: int, surface: Surface | None
+    ) -> BodyMotion:
         """A motion of vertices and faces that another one has checked and turned outwards."""
         motion = cls.__new__(cls)
         motion.vertices, motion.faces, motion.degenerate_faces = vertices, faces, degenerate_faces
         _, motion.fps, motion.start, motion.last = clock
+        motion.surface = surface
         return motion
 
     def __repr__(self) -> str:
@@ -148,6 +155,9 @@ class BodyMotion:
         rate = rate_of(path, data, fps)
         try:
             motion = cls(data.vertices, data.faces, rate, start=start_of(data, rate), last=data.last)
+            if data.surface is not None:
+                data.surface.check_vertices(motion.vertices.shape[1])
+                motion.surface = data.surface.following(data.faces, motion.faces)
             if collider and data.collider_faces is not None:
                 motion = motion.submesh(data.collider_faces)
             motion.source = source_of(
@@ -158,7 +168,7 @@ class BodyMotion:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes the motion as .npz, .usd (.usda, .usdc), .pc2 with .obj beside it, or a folder of .obj files.
+        """Writes the motion as .npz, .usd (.usda, .usdc), .glb, .pc2 with .obj beside it, or a folder of .obj files.
 
         The output is written completely or not at all, with the time of the first frame as `GarmentMotion.save` has it.
 
@@ -168,7 +178,8 @@ class BodyMotion:
         from warpgarment.io.data import MotionData
         from warpgarment.io.files import write_motion
 
-        write_motion(path, MotionData.of(self.vertices, self.faces, self.clock, name=Path(path).stem or "body"))
+        name = Path(path).stem or "body"
+        write_motion(path, MotionData.of(self.vertices, self.faces, self.clock, name=name, surface=self.surface))
 
     def resampled(self, fps: float, frames: int | None = None) -> BodyMotion:
         """The motion at another rate, with positions interpolated linearly in time.
@@ -187,13 +198,13 @@ class BodyMotion:
         if checked_fps(fps) == self.fps:
             return self
         clock, places = self.clock.resampled(fps, frames, points=self.vertices.shape[1])
-        return self._derived(between(self.vertices, places), self.faces, clock, self.degenerate_faces)
+        return self._derived(between(self.vertices, places), self.faces, clock, self.degenerate_faces, self.surface)
 
     def on_clock(self, clock: Clock) -> BodyMotion:
         """The motion at the frames of another clock, in a straight line between its own; before and after it stands
         still."""
         vertices = between(self.vertices, self.clock.places(clock.times))
-        return self._derived(vertices, self.faces, clock, self.degenerate_faces)
+        return self._derived(vertices, self.faces, clock, self.degenerate_faces, self.surface)
 
     def submesh(self, face_mask: Any) -> BodyMotion:
         """The motion of some faces only, without the vertices that belong to none of them.
@@ -213,4 +224,4 @@ class BodyMotion:
         faces = faces.reshape(-1, 3).astype(np.int32)
         vertices = self.vertices[:, used]
         flat = repeated_vertices(faces) | no_area(vertices[0], faces)
-        return self._derived(vertices, faces, self.clock, int(np.count_nonzero(flat)))
+        return self._derived(vertices, faces, self.clock, int(np.count_nonzero(flat)), None)

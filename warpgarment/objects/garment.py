@@ -29,6 +29,7 @@ from warpgarment.geometry.orientation import agreeing
 from warpgarment.geometry.seams import REMEDY as SEWING
 from warpgarment.geometry.seams import coinciding_borders
 from warpgarment.io.disk.cache import remembered
+from warpgarment.io.surface.record import Surface
 
 from .simulated import Simulated
 
@@ -50,6 +51,8 @@ class Garment:
         pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty if there are none.
         name: Name of the garment, for messages and file names.
         source: How its file was read (`warpgarment.io.source.Source`); None for a garment made of arrays.
+        surface: Polygons, texture coordinates, materials and groups, as the garment's file has them; a rollout hands
+            them on to its result. None: nothing but the triangles.
 
     Borders of panels that lie at the same place stay open unless they are joined (`clean=True`, `cleaned`), and small
     loose pieces such as buttons ride on the cloth: see `simulated`.
@@ -62,6 +65,7 @@ class Garment:
         faces: Vertex indices, integers, shape [F,3].
         pins: Vertices to tie to the body's surface, integers, shape [P]; None for none.
         name: Name of the garment, any text.
+        surface: Polygons that name these vertices, with their looks; None for none.
 
     Raises:
         MeshError: The arrays have other shapes or are empty, or there are numbers that are not finite, indices out of
@@ -71,12 +75,13 @@ class Garment:
     """
 
     source: Source | None = None
+    surface: Surface | None = None
     _joined: tuple[Garment, np.ndarray] | None = None  # a mesh with its seams joined, and where each vertex went [V]
 
-    def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = ""):
+    def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", surface: Surface | None = None):
         self.vertices = checked_positions(vertices)
-        self.faces = checked_faces(faces, len(self.vertices), remedy=REMEDY)
-        self.faces = agreeing(self.vertices, self.faces, f"garment {name!r}" if name else "the garment")
+        given = checked_faces(faces, len(self.vertices), remedy=REMEDY)
+        self.faces = agreeing(self.vertices, given, f"garment {name!r}" if name else "the garment")
         far = far_from_origin(vertices, self.faces, f"garment {name!r}" if name else "the garment")
         if far:
             complain(no_area(self.vertices, self.faces), "faces", "have no area", far)
@@ -84,6 +89,9 @@ class Garment:
         check_rest_mesh(self.vertices, self.faces)
         self.pins = checked_pins(pins, len(self.vertices))
         self.name = str(name)
+        self.surface = None if surface is None else surface.following(given, self.faces)
+        if self.surface is not None:
+            self.surface.check_vertices(len(self.vertices))
 
     def __repr__(self) -> str:
         pins = f", {len(self.pins):,} pins" if len(self.pins) else ""
@@ -132,7 +140,7 @@ class Garment:
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh, up=up)
         try:
-            told: dict[str, Any] = {"pins": data.pins, "name": data.name or path.stem}
+            told: dict[str, Any] = {"pins": data.pins, "name": data.name or path.stem, "surface": data.surface}
             garment = (
                 cls.cleaned_from(data.vertices, data.faces, **told, keep=True)
                 if clean
@@ -145,9 +153,10 @@ class Garment:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes the garment as .obj, .ply, .npz or .usd (.usda, .usdc), completely or not at all.
+        """Writes the garment as .obj, .ply, .npz, .glb (.gltf) or .usd (.usda, .usdc), completely or not at all.
 
-        Only .npz files keep the pins.
+        Only .npz files keep the pins. Polygons, texture coordinates, materials and groups that were read are written
+        where the format has them; a warning says what is left out. The materials of an .obj lie in a .mtl beside it.
 
         Args:
             path: File to write; its suffix decides the format.
@@ -155,11 +164,18 @@ class Garment:
         from warpgarment.io.data import MeshData
         from warpgarment.io.files import write_mesh
 
-        write_mesh(Path(path), MeshData(self.vertices, self.faces, self.pins, self.name))
+        write_mesh(Path(path), MeshData(self.vertices, self.faces, self.pins, self.name, self.surface))
 
     @classmethod
     def cleaned_from(
-        cls, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", keep: bool = False
+        cls,
+        vertices: Any,
+        faces: Any,
+        *,
+        pins: Any = None,
+        name: str = "",
+        keep: bool = False,
+        surface: Surface | None = None,
     ) -> Garment:
         """A garment from a mesh that the constructor refuses, or whose seams are open.
 
@@ -167,8 +183,8 @@ class Garment:
         an edge has no more than two faces after it; vertices inside a surface never are. Vertices that are not finite
         are removed with their faces; faces with indices out of range, with a vertex twice or without area, and repeated
         faces are removed; where more than two faces share an edge, the largest two stay; neighbours that disagree on
-        the outside are flipped to agree with the majority; vertices without a face are removed. Pins follow their
-        vertices.
+        the outside are flipped to agree with the majority; vertices without a face are removed. Pins and surface follow
+        their vertices; of the surface those polygons stay that have a face left.
 
         Args:
             vertices: Rest positions [m], shape [V,3].
@@ -177,6 +193,7 @@ class Garment:
             name: Name of the garment, any text.
             keep: Whether the garment has all finite vertices that were given, in their order, and what is simulated has
                 the joined ones only. Vertices without a face are carried by the cloth nearest to them.
+            surface: Polygons that name vertices before cleaning; None for none.
 
         Raises:
             MeshError: Nothing is left, or the arrays have another shape.
@@ -188,14 +205,20 @@ class Garment:
         what = f"garment {name!r}" if name else "the garment"
         given = checked_pins(pins, len(cleaned.went))
         new_pins = cleaned.went[given]
-        garment = cls(cleaned.vertices, cleaned.faces, pins=new_pins[new_pins >= 0], name=name)
+        if surface is not None:
+            surface.check_vertices(len(cleaned.went))
+            surface = surface.left_of(to_numpy(faces), cleaned.rows, cleaned.corners)
+        shown = None if surface is None else surface.renumbered(cleaned.went)
+        garment = cls(cleaned.vertices, cleaned.faces, pins=new_pins[new_pins >= 0], name=name, surface=shown)
         _warn(cleaned.message(what))
         if keep and len(cleaned.went) > len(cleaned.vertices):
             all_vertices = np.asarray(to_numpy(vertices), dtype=np.float32)
-            garment = garment._with_all(all_vertices, cleaned.corners, cleaned.went, given)
+            garment = garment._with_all(all_vertices, cleaned.corners, cleaned.went, given, surface)
         return garment
 
-    def _with_all(self, vertices: np.ndarray, faces: np.ndarray, went: np.ndarray, pins: np.ndarray) -> Garment:
+    def _with_all(
+        self, vertices: np.ndarray, faces: np.ndarray, went: np.ndarray, pins: np.ndarray, surface: Surface | None
+    ) -> Garment:
         """A garment of vertices [U,3] before cleaning, of which this one is simulated; `went` [U] as in `Cleaned`."""
         finite = np.isfinite(vertices).all(axis=1)
         number = np.cumsum(finite) - 1
@@ -204,12 +227,14 @@ class Garment:
         whole = type(self).__new__(type(self))
         whole.vertices, whole.faces = np.ascontiguousarray(vertices[finite]), number[faces].astype(np.int32)
         whole.pins, whole.name = number[pins[went[pins] >= 0]].astype(np.int32), self.name
+        whole.surface = None if surface is None else surface.renumbered(np.where(finite, number, -1))
         whole._joined = self, went[finite]
         return whole
 
     def cleaned(self, *, keep: bool = False) -> Garment:
         """A cleaned copy: joins open borders at the same place, such as the two sides of a seam; see `cleaned_from`."""
-        return self.cleaned_from(self.vertices, self.faces, pins=self.pins, name=self.name, keep=keep)
+        told: dict[str, Any] = {"pins": self.pins, "name": self.name, "surface": self.surface}
+        return self.cleaned_from(self.vertices, self.faces, **told, keep=keep)
 
     @cached_property
     def simulated(self) -> Simulated:

@@ -13,6 +13,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
+from warpgarment.io.surface.record import Surface
 
 from .clock import Clock, between
 from .status import RolloutStatus, Verdict
@@ -29,6 +30,7 @@ class GarmentMotion:
         name: Name of the garment, for messages and file names.
         start: Time of the first frame [s].
         last: When the last frame is reached, in frames after the first, as in `BodyMotion`.
+        surface: Polygons, texture coordinates, materials and groups of the garment's file, for `save`; None: triangles.
 
     Raises:
         MeshError: Shapes do not fit each other, an index is out of range, a time is none, or the number of statuses is
@@ -45,12 +47,16 @@ class GarmentMotion:
         *,
         start: float = 0.0,
         last: float | None = None,
+        surface: Surface | None = None,
     ):
         self.vertices = checked_positions(vertices, frames=True, finite=False)
         self.faces = checked_faces(faces, self.vertices.shape[1])
         _, self.fps, self.start, self.last = Clock.checked(len(self.vertices), fps, start, last)
         self.status = list(status)
         self.name = str(name)
+        self.surface = surface
+        if surface is not None:
+            surface.check_vertices(self.vertices.shape[1])
         if self.status and len(self.status) != len(self.vertices):
             raise MeshError(f"{len(self.status)} statuses for {len(self.vertices)} frames. Give one a frame, or none.")
 
@@ -106,7 +112,8 @@ class GarmentMotion:
             near = (self.status[int(np.floor(place))], self.status[int(np.ceil(place))])
             worse = max(near, key=lambda status: (not status.finite, status.max_penetration))
             status.append(replace(worse, frame=frame))
-        return GarmentMotion(vertices, self.faces, clock.fps, status, self.name, start=clock.start, last=clock.last)
+        times: dict[str, Any] = {"start": clock.start, "last": clock.last}
+        return GarmentMotion(vertices, self.faces, clock.fps, status, self.name, **times, surface=self.surface)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes the motion, completely or not at all.
@@ -114,11 +121,17 @@ class GarmentMotion:
         - ``.npz``: positions, faces, rate, start [s], status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres; time
           codes are frames, and the first one is `start` x `fps`: 1001 for a shot that starts there;
+        - ``.glb``, ``.gltf``: triangles with a morph target per frame, which an animation shows one after another, from
+          `start` on;
         - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it; the
           header says at which frame it starts;
         - no suffix, or a slash at the end: a folder ``frame_1001.obj``, ``frame_1002.obj``, ..., the first number being
           `start` x `fps` (with a warning where that is not whole); an existing folder is replaced if it holds nothing
           else.
+
+        Polygons, texture coordinates, materials (base colour, opacity, name of a picture) and groups that were read
+        with the garment are written too, in the order of its file; materials of OBJ into a .mtl beside it. glTF has
+        triangles alone and neither objects nor groups. A warning says in one line what a format leaves out.
 
         Args:
             path: File or folder to write; parent folders are made.
@@ -133,7 +146,8 @@ class GarmentMotion:
         from warpgarment.io.files import write_motion
 
         name, extra = self.name or "garment", self._status_arrays()
-        write_motion(path, MotionData.of(self.vertices, self.faces, self.clock, name=name, extra=extra))
+        motion = MotionData.of(self.vertices, self.faces, self.clock, name=name, extra=extra, surface=self.surface)
+        write_motion(path, motion)
 
     @classmethod
     def load(
@@ -152,7 +166,7 @@ class GarmentMotion:
             unit: Length unit of the file: "m", "dm", "cm", "mm" or "in". None keeps the numbers, except that USD files
                 are converted by their own `metersPerUnit` and `upAxis`.
             fps: Overrides the file's rate; 30, with a warning, where neither says, as .pc2 and folders of .obj do not.
-            mesh: See `BodyMotion.load`.
+            mesh: See `BodyMotion.load`; None reads all objects of a folder of OBJ or of a .pc2's mesh as one.
             up: See `BodyMotion.load`.
 
         Raises:
@@ -162,10 +176,10 @@ class GarmentMotion:
         Warns:
             UserWarning: Frames hold NaN or infinity without a status that says so.
         """
-        from warpgarment.io.files import rate_of, read_motion, start_of
+        from warpgarment.io.files import rate_of, read_motion, start_of, whole_output
 
         path = Path(path)
-        data = read_motion(path, unit=unit, mesh=mesh, up=up)
+        data = read_motion(path, unit=unit, mesh=whole_output(path, mesh), up=up)
         if path.suffix.lower() == ".npz" and data.fps is None and fps is None:
             raise MeshError(f"{path}: no array named 'fps'; it is not what GarmentMotion.save writes. Give fps=.")
         rate = rate_of(path, data, fps)
@@ -177,8 +191,8 @@ class GarmentMotion:
                 rows = zip(*columns, verdicts, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
             name = str(data.extra["name"]) if "name" in data.extra else path.stem
-            start = start_of(data, rate)
-            motion = cls(data.vertices, data.faces, rate, status, name, start=start, last=data.last)
+            times: dict[str, Any] = {"start": start_of(data, rate), "last": data.last}
+            motion = cls(data.vertices, data.faces, rate, status, name, **times, surface=data.surface)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
         said = np.array([not one.finite for one in status] or [False] * motion.frames)

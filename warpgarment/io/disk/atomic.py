@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from warpgarment.errors import OutputError
@@ -99,8 +99,12 @@ def _moved(source: Path, target: Path) -> bool:
     return True
 
 
-def check_replaceable(path: Path, replaces: str) -> None:
+def check_replaceable(path: Path, replaces: str | Sequence[str]) -> None:
     """Refuses a folder that `atomic_folder` would not replace.
+
+    Args:
+        path: The folder.
+        replaces: As of `atomic_folder`.
 
     Raises:
         FileExistsError: The folder holds something else, or a file has its name.
@@ -109,23 +113,26 @@ def check_replaceable(path: Path, replaces: str) -> None:
         return
     if not path.is_dir():
         raise FileExistsError(f"{path} is a file. Choose another folder.")
-    strangers = sorted(item.name for item in path.iterdir() if item.is_dir() or not item.match(replaces))
+    patterns = [replaces] if isinstance(replaces, str) else list(replaces)
+    strangers = sorted(i.name for i in path.iterdir() if i.is_dir() or not any(map(i.match, patterns)))
     if strangers:
         raise FileExistsError(
-            f"{path} holds {len(strangers):,} entries that are not {replaces} (first: {strangers[0]}) and would "
-            "be lost. Choose another folder."
+            f"{path} holds {len(strangers):,} entries that are not {' or '.join(patterns)} (first: {strangers[0]}) and "
+            "would be lost. Choose another folder."
         )
 
 
 @contextlib.contextmanager
-def atomic_folder(path: Path, replaces: str, stays: Callable[[Path], bool] | None = None) -> Iterator[Path]:
+def atomic_folder(
+    path: Path, replaces: str | Sequence[str], stays: Callable[[Path], bool] | None = None
+) -> Iterator[Path]:
     """Yields a temporary folder that takes the target's place on success and vanishes on any error.
 
     An old folder is moved aside first and put back should the last rename fail, by the next save if need be.
 
     Args:
         path: Where the folder shall appear.
-        replaces: Glob pattern; an existing folder is replaced only if each of its files matches.
+        replaces: Glob pattern, or several; an existing folder is replaced only if each of its files matches one.
         stays: Whether a folder that is there when the temporary one is complete is kept instead of it. Then the first
             of several processes that write the same folder wins, and those who read it already keep their files.
 

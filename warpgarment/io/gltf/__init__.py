@@ -10,12 +10,15 @@ from warpgarment.errors import MeshError
 from warpgarment.io.data import Format, Holds, MeshData, MotionData, ReadOptions
 from warpgarment.io.joined import join_exact
 from warpgarment.io.parts import ALL, Parts, connected_pieces, listed, named, unconnected
+from warpgarment.io.surface.record import say_left_out, worth_keeping
 from warpgarment.io.times import frames_of
 
 from .animation import Channels
 from .container import Document
+from .looks import SETS, surface_of
 from .scene import Placed, Scene
 from .schema import Damaged
+from .writing import write_gltf
 
 LARGEST, RATIO = 256 << 20, 1_000  # bytes of positions from which on a file must have a thousandth of them
 
@@ -59,7 +62,7 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
     if mesh not in (None, ALL):
         chosen = named(path, str(mesh), names, Parts([one.mesh for one in placed], np.arange(len(placed))))
         placed = [one for one, wanted in zip(placed, chosen, strict=True) if wanted]
-    vertices, faces, owner = _joined(placed)
+    vertices, faces, owner, split = _joined(placed)
     if mesh is None:
         pieces = connected_pieces(vertices.shape[1], np.full(len(faces), 3), faces.reshape(-1))
         if unconnected(Parts(names.names, owner), pieces):
@@ -69,7 +72,8 @@ def read_gltf(path: Path, *, mesh: str | None = None, moving: bool = True) -> tu
             )
     name = placed[0].name if len(placed) == 1 else ""
     seconds = float(codes[0]) if len(frames.codes) else None
-    return MotionData(vertices, faces, frames.fps, name=name, seconds=seconds), name
+    surface = worth_keeping(path, lambda: surface_of(path, document, placed, split, faces))
+    return MotionData(vertices, faces, frames.fps, name=name, seconds=seconds, surface=surface), name
 
 
 def _still(document: Document) -> Document:
@@ -77,8 +81,8 @@ def _still(document: Document) -> Document:
     return document
 
 
-def _joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Meshes as one: positions float32 [T,V,3], faces [F,3], and the mesh of each face [F].
+def _joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Meshes as one: positions float32 [T,V,3], faces [F,3], the mesh of each face [F], and faces before the joining.
 
     Vertices become one where they are at exactly the same place in the first, the middle and the last frame.
     """
@@ -90,13 +94,17 @@ def _joined(placed: list[Placed]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     faces = np.concatenate([one.faces + base for one, base in zip(placed, bases[:-1], strict=True)])
     owner = np.repeat(np.arange(len(placed)), [len(one.faces) for one in placed])
     places = vertices[[0, count // 2, count - 1]].transpose(1, 0, 2).reshape(vertices.shape[1], -1)
-    kept, faces = join_exact(places, faces)
-    return vertices[:, kept], faces, owner
+    kept, joined = join_exact(places, faces)
+    return vertices[:, kept], joined, owner, faces
 
 
 def _read_mesh(path: Path, options: ReadOptions) -> MeshData:
     found, name = read_gltf(path, mesh=options.mesh, moving=False)
-    return MeshData(found.vertices[0], found.faces, name=name)
+    return MeshData(found.vertices[0], found.faces, name=name, surface=found.surface)
+
+
+def _write_mesh(path: Path, data: MeshData) -> None:
+    _write_motion(path, MotionData(np.asarray(data.vertices)[None], data.faces, name=data.name, surface=data.surface))
 
 
 def _read_motion(path: Path, options: ReadOptions) -> MotionData:
@@ -113,4 +121,9 @@ def _holds(path: Path) -> Holds:
         return Holds((), 1.0, "y")
 
 
-FORMAT = Format(read_mesh=_read_mesh, read_motion=_read_motion, named=True, axis=True, holds=_holds)
+def _write_motion(path: Path, data: MotionData) -> None:
+    say_left_out(path, data.surface, sets=SETS, keeps="materials")
+    write_gltf(path, data)
+
+
+FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True, axis=True, holds=_holds)

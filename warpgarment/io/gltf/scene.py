@@ -14,13 +14,22 @@ from .schema import Damaged
 TRIANGLES, STRIP, FAN = 4, 5, 6
 
 
+class Part(NamedTuple):
+    """A primitive of a mesh, and how many vertices and triangles it has."""
+
+    primitive: dict[str, Any]
+    vertices: int
+    faces: int
+
+
 class Placed(NamedTuple):
-    """One mesh of the scene: name of its node, else its mesh; name of its mesh; positions [T,V,3], faces [F,3]."""
+    """One mesh: name of its node, else its own; its own; positions [T,V,3]; faces [F,3]; its primitives in order."""
 
     name: str
     mesh: str
     vertices: np.ndarray
     faces: np.ndarray
+    parts: tuple[Part, ...] = ()
 
 
 class Scene:
@@ -87,7 +96,7 @@ class Scene:
         """The mesh of a node, all its primitives."""
         node = self._document.item("nodes", number)
         mesh = self._document.item("meshes", node["mesh"])
-        vertices, faces, base = [], [], 0
+        vertices, faces, parts, base = [], [], [], 0
         for primitive in mesh["primitives"]:
             mode = primitive.get("mode", TRIANGLES)
             if mode not in (TRIANGLES, STRIP, FAN):
@@ -97,6 +106,7 @@ class Scene:
             mirrored = np.linalg.det(self._matrices(number)[0, :3, :3]) < 0 and "skin" not in node
             faces.append((corners[:, ::-1] if mirrored else corners) + base)
             vertices.append(positions)
+            parts.append(Part(primitive, positions.shape[1], len(corners)))
             base += positions.shape[1]
         count = max((len(v) for v in vertices), default=1)
         together = [np.broadcast_to(v, (count, *v.shape[1:])) for v in vertices]
@@ -106,6 +116,7 @@ class Scene:
             name,
             np.concatenate(together, axis=1) if together else np.zeros((1, 0, 3)),
             np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64),
+            tuple(parts),
         )
 
     def _positions(
@@ -123,8 +134,10 @@ class Scene:
                 weights = np.array(still, dtype=np.float64)[None]
             if weights.shape[1] != len(primitive["targets"]):
                 raise Damaged(f"{weights.shape[1]} weights for {len(primitive['targets'])} morph targets")
+            points = np.repeat(points, len(weights), axis=0)
             for k, target in zip(every, targets, strict=True):
-                points = points + weights[:, k, None, None] * _points(self._document.array(target), points.shape[1])
+                move, there = _points(self._document.array(target), points.shape[1]), weights[:, k] != 0
+                points[there] += weights[there, k, None, None] * move
         if "skin" in node:
             return self._skinned(points, self._document.item("skins", node["skin"]), attributes)
         matrices = self._matrices(number)

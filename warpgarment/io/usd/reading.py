@@ -13,8 +13,10 @@ from warpgarment.errors import MeshError
 from warpgarment.io.data import Holds
 from warpgarment.io.disk.plain import check_plain
 from warpgarment.io.polygons import triangulate_counts
+from warpgarment.io.surface.record import Surface, worth_keeping
 from warpgarment.io.times import Frames, frames_of
 
+from .looks import surface_of
 from .skeleton import Skinning, skinning_of
 from .writing import pxr
 
@@ -29,6 +31,7 @@ class UsdMesh(NamedTuple):
     faces: np.ndarray  # int64 [F,3]
     fps: float | None  # None for a single frame
     start: float = 0.0  # time of the first frame in frames: its time code, where the stage counts frames; of one, [s]
+    surface: Surface | None = None  # polygons as they are seen from outside; None: triangles alone
 
 
 def read_usd(
@@ -75,12 +78,15 @@ def _read(stage: Any, path: Path, mesh: str | None, frames: bool, convert: bool,
     if indices.min() < 0 or indices.max() >= vertices.shape[1]:
         raise MeshError(f"{where}: faces name points beyond the {vertices.shape[1]:,} it has.")
     try:
-        faces = triangulate_counts(vertices[0], counts, indices)
+        faces = triangles = triangulate_counts(vertices[0], counts, indices)
     except MeshError as error:
         raise MeshError(f"{where}: {error}") from None
     left = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
     if left != (_determinant(prim, skinning, times[0], UsdGeom) < 0):
         faces = faces[:, ::-1].copy()
+    surface = worth_keeping(where, lambda: surface_of(prim, counts, indices, vertices.shape[1], times[0]))
+    if surface is not None:
+        surface = surface.following(triangles, faces)
     if turn and UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
         vertices = np.stack([vertices[..., 0], vertices[..., 2], -vertices[..., 1]], axis=-1)
     if convert:
@@ -88,7 +94,7 @@ def _read(stage: Any, path: Path, mesh: str | None, frames: bool, convert: bool,
     fps = chosen.fps
     start = float(chosen.codes[0]) * (fps or 1.0) / stage.GetTimeCodesPerSecond() if len(chosen.codes) else 0.0
     with np.errstate(over="ignore"):
-        return UsdMesh(prim.GetName(), vertices.astype(np.float32), faces, fps, start)
+        return UsdMesh(prim.GetName(), vertices.astype(np.float32), faces, fps, start, surface)
 
 
 def usd_holds(path: Path) -> Holds:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,9 @@ import numpy as np
 from warpgarment.errors import MeshError, MissingExtra, OutputError
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.io.surface.record import Surface, of_triangles
+
+from .dressing import Wardrobe, coordinates_name, dress, identifier
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 
@@ -31,7 +34,12 @@ def pxr() -> tuple[Any, ...]:
 
 
 def write_usd(
-    path: Path, meshes: Sequence[tuple[str, np.ndarray, np.ndarray]], fps: float, *, start: float = 0.0
+    path: Path,
+    meshes: Sequence[tuple[str, np.ndarray, np.ndarray]],
+    fps: float,
+    surfaces: Sequence[Surface | None] = (),
+    *,
+    start: float = 0.0,
 ) -> None:
     """Writes meshes as one stage, completely or not at all.
 
@@ -41,6 +49,7 @@ def write_usd(
         path: .usd, .usda or .usdc.
         meshes: Name, vertices [T,V,3] in metres and faces [F,3] of each, such as garment and body; the same T for all.
         fps: Time codes (frames) per second.
+        surfaces: What is written of each mesh instead of its triangles; None, or none for all: nothing.
         start: Time code of the first frame.
 
     Raises:
@@ -70,12 +79,13 @@ def write_usd(
         stage.SetEndTimeCode(start + len(checked[0][1]) - 1)
         root = UsdGeom.Xform.Define(stage, "/root")
         stage.SetDefaultPrim(root.GetPrim())
-        taken: set[str] = set()
-        for name, vertices, faces in checked:
-            mesh = UsdGeom.Mesh.Define(stage, f"/root/{_identifier(name, taken)}")
+        taken, wardrobe = {"materials"}, Wardrobe(stage, path)
+        for (name, vertices, faces), surface in zip(checked, surfaces or [None] * len(checked), strict=True):
+            mesh = UsdGeom.Mesh.Define(stage, f"/root/{identifier(name, taken)}")
             mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-            mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, dtype=np.int32)))
-            mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1)))
+            surface = surface or of_triangles(faces)
+            coordinates = coordinates_name(surface)
+            dress(mesh, surface, partial(wardrobe.material, coordinates=coordinates))
             points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
             for frame, positions in enumerate(vertices):
                 points.Set(Vt.Vec3fArray.FromNumpy(positions), start + frame)
@@ -96,13 +106,3 @@ def _said(path: Path) -> Iterator[None]:
     except Tf.ErrorException as error:
         said = "; ".join(str(entry.commentary) for entry in error.args) or str(error)
         raise OutputError(f"{path}: USD cannot write it: {said}") from error
-
-
-def _identifier(name: str, taken: set[str]) -> str:
-    base = re.sub(r"[^A-Za-z0-9_]", "_", name) or "mesh"
-    base = f"_{base}" if base[0].isdigit() else base
-    unique, n = base, 1
-    while unique in taken:
-        unique, n = f"{base}_{n}", n + 1
-    taken.add(unique)
-    return unique
