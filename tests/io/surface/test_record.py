@@ -119,6 +119,42 @@ def test_cleaning_keeps_the_polygons_that_it_does_not_drop(tmp_path):
         assert close(dressed.read_obj(tmp_path / "a.obj")[0], expected(VERTICES))
 
 
+def panels(folder):
+    """The skirt as two panels: the vertices of one column are there twice, the polygons behind it name the doubles."""
+    path = dressed.write_obj(folder / "skirt.obj")
+    doubled = [row * dressed.AROUND for row in range(dressed.RINGS)]
+    number = {v: len(VERTICES) + k for k, v in enumerate(doubled)}
+    rows, at = [], 0
+    for line in path.read_text().splitlines():
+        if line.startswith("f "):
+            polygon, at = POLYGONS[at], at + 1
+            last = {v for v, t in zip(polygon.vertices, polygon.coordinates, strict=True) if t % 13 == 12}
+            words = [(number[v] if v in last else v, t) for v, t in
+                     zip(polygon.vertices, polygon.coordinates, strict=True)]  # fmt: skip
+            line = "f " + " ".join(f"{v + 1}/{t + 1}" for v, t in words)
+        rows.append(line)
+    first = next(k for k, row in enumerate(rows) if row.startswith("vt "))
+    rows[first:first] = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in VERTICES[doubled].tolist()]
+    path.write_text("\n".join(rows))
+    return path
+
+
+def test_seams_that_are_joined_leave_the_polygons_of_the_file(tmp_path):
+    """Panels that are simulated as one would come back with polygons that name other vertices than the file's."""
+    with pytest.warns(UserWarning, match="joined"):
+        garment = wg.Garment.load(panels(tmp_path), clean=True)
+    assert len(garment.vertices) == len(VERTICES) + dressed.RINGS
+    assert len(garment.simulated.garment.vertices) == len(VERTICES)
+    garment.save(tmp_path / "a.obj")
+    assert close(dressed.read_obj(tmp_path / "a.obj")[0], expected(VERTICES))
+    with pytest.warns(UserWarning, match="joined"):
+        joined = garment.cleaned()
+    assert len(joined.vertices) == len(VERTICES)
+    joined.save(tmp_path / "b.obj")
+    assert close(dressed.read_obj(tmp_path / "b.obj")[0], expected(VERTICES))
+    np.testing.assert_array_equal(np.sort(joined.surface.corners), np.sort(CORNERS))
+
+
 def test_what_cleaning_turns_round_is_turned_in_the_output(tmp_path):
     """Polygons would look inwards that the simulation and its normals have outwards; their coordinates would mix."""
     text = dressed.write_obj(tmp_path / "skirt.obj").read_text().splitlines()
