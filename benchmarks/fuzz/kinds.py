@@ -6,11 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from . import dressed_files as dressed
 from . import mesh_files as meshes
 from . import page_files as pages
 from . import set_files as sets
 
-TEXTS = (".obj", ".off", ".gltf", ".usda", ".bvh", ".json", ".jsonl")
+TEXTS = (".obj", ".mtl", ".off", ".gltf", ".usda", ".bvh", ".json", ".jsonl")
 
 
 class Kind(NamedTuple):
@@ -56,6 +57,14 @@ KINDS: dict[str, Kind] = {
     "npz_garment": Kind(meshes.write_garment_npz, meshes.garment),
     "npz_motion": Kind(meshes.write_motion_npz, meshes.motion),
     "npz_body": Kind(meshes.write_body_npz, meshes.body),
+    "obj_dressed": Kind(dressed.write_obj, dressed.garment),
+    "obj_materials": Kind(dressed.write_obj, dressed.garment, files="*.mtl"),
+    "folder_dressed": Kind(dressed.write_folder, dressed.stage),
+    "npz_dressed": Kind(dressed.write_npz, dressed.stage),
+    "usda_dressed": Kind(dressed.write_usda, dressed.stage),
+    "glb_dressed": Kind(dressed.write_glb, dressed.stage),
+    "gltf_dressed": Kind(dressed.write_gltf, dressed.garment),
+    "ply_dressed": Kind(dressed.write_ply, dressed.garment, text=True),
     "sequence": Kind(sets.add_sequence, sets.sequence),
     "sequence_manifest": Kind(sets.add_sequence, sets.sequence, files="manifest.json"),
     "set_verified": Kind(sets.add_set, sets.checked_set, noticed=(".npy",)),

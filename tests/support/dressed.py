@@ -69,6 +69,34 @@ def write_obj(path: Path, library: bool = True) -> Path:
     return path
 
 
+DOUBLED = np.arange(RINGS) * AROUND  # vertices of the column that is there twice in panels
+
+
+def write_panels(path: Path) -> Path:
+    """The skirt as a panel sewn to itself.
+
+    Vertices `DOUBLED` are there twice, and polygons behind the seam name the twins.
+    """
+    text = write_obj(path).read_text().splitlines()
+    first = next(k for k, row in enumerate(text) if row.startswith("vt "))
+    text[first:first] = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in VERTICES[DOUBLED].tolist()]
+    faces = iter(panel_corners())
+    text = [
+        "f " + " ".join(f"{v + 1}/{t + 1}" for v, t in next(faces)) if row.startswith("f ") else row for row in text
+    ]
+    path.write_text("\n".join(text))
+    return path
+
+
+def panel_corners() -> list[list[tuple[int, int]]]:
+    """Vertices and texture coordinates of the corners of `write_panels`."""
+    twin = {v: len(VERTICES) + k for k, v in enumerate(DOUBLED.tolist())}
+    return [
+        [(twin[v] if t % (AROUND + 1) == AROUND else v, t) for v, t in zip(p.vertices, p.coordinates, strict=True)]
+        for p in POLYGONS
+    ]
+
+
 Corner = tuple[tuple[float, ...], tuple[float, ...]]
 Read = list[tuple[list[Corner], str]]
 

@@ -51,6 +51,6 @@ def run(options: Convert) -> None:
         )
     if options.fps is not None:
         motion = motion.resampled(options.fps)
-    with spoken(fps="--fps"):
+    with spoken(fps="--fps", output="OUTPUT"):
         motion.save(options.output)
     print(f"{options.output}: {in_words(motion.clock)}, {motion.vertices.shape[1]} vertices")

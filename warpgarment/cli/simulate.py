@@ -94,6 +94,7 @@ def run(options: Simulate) -> None:
         frames = body.clock.resampled(fps, options.frames)[0].frames
         check_space(options.out, len(garment.vertices) * frames * 12)
         motion = simulator.rollout(garment, body, **known, progress=sys.stderr.isatty())
+    with spoken(out="--out"):
         motion.save(options.out)
     name = garment.name or "garment"
     print(rollout_table({name: motion}, {name: simulator.timings}))

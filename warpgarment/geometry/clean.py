@@ -25,6 +25,8 @@ class Cleaned(NamedTuple):
     """New index of each old vertex, int64 [V]; -1 if it was dropped."""
     corners: np.ndarray
     """The old vertices of each new face, int64 [F',3]."""
+    rows: np.ndarray
+    """Which of the old faces each new one was, int64 [F']."""
     turned: int
     """Faces that were turned round."""
     dropped: int
@@ -65,17 +67,17 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> Cleaned:
     vertices, faces = np.asarray(to_numpy(vertices), dtype=np.float32), to_numpy(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(f"Need vertices [V,3] and faces [F,3], got {list(vertices.shape)} and {list(faces.shape)}.")
-    corners, count = faces.astype(np.int64), len(faces)
-    corners = corners[((corners >= 0) & (corners < len(vertices))).all(axis=1)]
+    given, count = faces.astype(np.int64), len(faces)
+    rows = np.flatnonzero(((given >= 0) & (given < len(vertices))).all(axis=1))
     usable = np.isfinite(vertices).all(axis=1)
-    corners = corners[usable[corners].all(axis=1)]
-    corners = corners[_with_area(vertices, _exact(vertices)[corners])]
-    seams = coinciding_borders(vertices, corners)
+    rows = rows[usable[given[rows]].all(axis=1)]
+    rows = rows[_with_area(vertices, _exact(vertices)[given[rows]])]
+    seams = coinciding_borders(vertices, given[rows])
     merged = seams.group
-    corners = corners[_with_area(vertices, merged[corners])]
-    corners = corners[_largest_two_per_edge(vertices, merged[corners])]
-    flip, keep = _orient(vertices, merged[corners])
-    corners = np.where(flip[:, None], corners[:, ::-1], corners)[keep]
+    rows = rows[_with_area(vertices, merged[given[rows]])]
+    rows = rows[_largest_two_per_edge(vertices, merged[given[rows]])]
+    flip, keep = _orient(vertices, merged[given[rows]])
+    corners, rows = np.where(flip[:, None], given[rows][:, ::-1], given[rows])[keep], rows[keep]
     if len(corners) == 0:
         raise MeshError("Nothing is left after cleaning: no face has three different, finite vertices and an area.")
     used = np.unique(merged[corners])
@@ -87,6 +89,7 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> Cleaned:
         went[corners].astype(np.int32),
         went,
         corners,
+        rows,
         int(np.count_nonzero(flip[keep])),
         count - len(corners),
         seams,

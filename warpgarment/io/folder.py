@@ -107,12 +107,12 @@ def _spread(path: Path, numbers: list[int], frames: np.ndarray) -> tuple[int, np
 
 
 def write_folder(path: Path, data: MotionData) -> None:
-    """Writes frame_1001.obj, frame_1002.obj, ... from the number of the first frame on, and materials.mtl if need be.
+    """Writes frame_1001.obj, frame_1002.obj, ... from the number of the first frame on, and materials.mtl.
 
-    A folder that holds nothing else is replaced.
+    The latter only where there are materials. A folder that holds nothing else is replaced.
 
     Warns:
-        UserWarning: The first frame lies between two numbers, or before 0.
+        UserWarning: The first frame lies between two numbers, or before 0; or OBJ cannot hold all of the surface.
     """
     begins = data.start or 0.0
     first = max(round(begins), 0)
@@ -124,9 +124,9 @@ def write_folder(path: Path, data: MotionData) -> None:
             stacklevel=4,
         )
     say_left_out(path, data.surface, sets=1, keeps=OBJ_KEEPS)
+    digits = max(4, len(str(first + len(data.vertices) - 1)))
     library = LIBRARY if has_materials(data.surface) else ""
     around = text_around(data.surface or of_triangles(data.faces), data.name, library)
-    digits = max(4, len(str(first + len(data.vertices) - 1)))
     with atomic_folder(path, FRAME) as folder:
         if library and data.surface is not None:
             (folder / library).write_text(mtl_text(data.surface, path), encoding="utf-8")

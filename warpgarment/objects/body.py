@@ -62,8 +62,8 @@ class BodyMotion:
         UserWarning: Faces were turned round; or the body is so far from the origin that float32 cannot tell its shape.
     """
 
-    surface: Surface | None = None
     source: Source | None = None
+    surface: Surface | None = None
 
     def __init__(self, vertices: Any, faces: Any, fps: float = 30.0, *, start: float = 0.0, last: float | None = None):
         self.vertices = checked_positions(vertices, frames=True)
@@ -83,12 +83,7 @@ class BodyMotion:
 
     @classmethod
     def _derived(
-        cls,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        clock: Clock,
-        degenerate_faces: int,
-        surface: Surface | None = None,
+        cls, vertices: np.ndarray, faces: np.ndarray, clock: Clock, degenerate_faces: int, surface: Surface | None
     ) -> BodyMotion:
         """A motion of vertices and faces that another one has checked and turned outwards."""
         motion = cls.__new__(cls)
@@ -229,4 +224,4 @@ class BodyMotion:
         faces = faces.reshape(-1, 3).astype(np.int32)
         vertices = self.vertices[:, used]
         flat = repeated_vertices(faces) | no_area(vertices[0], faces)
-        return self._derived(vertices, faces, self.clock, int(np.count_nonzero(flat)))
+        return self._derived(vertices, faces, self.clock, int(np.count_nonzero(flat)), None)

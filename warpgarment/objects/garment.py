@@ -50,9 +50,9 @@ class Garment:
         faces: Vertex indices, counter-clockwise seen from outside, int32, shape [F,3].
         pins: Vertices that stay tied to the body's surface, int32, shape [P], sorted; empty if there are none.
         name: Name of the garment, for messages and file names.
+        source: How its file was read (`warpgarment.io.source.Source`); None for a garment made of arrays.
         surface: Polygons, texture coordinates, materials and groups, as the garment's file has them; a rollout hands
             them on to its result. None: nothing but the triangles.
-        source: How its file was read (`warpgarment.io.source.Source`); None for a garment made of arrays.
 
     Borders of panels that lie at the same place stay open unless they are joined (`clean=True`, `cleaned`), and small
     loose pieces such as buttons ride on the cloth: see `simulated`.
@@ -74,8 +74,8 @@ class Garment:
             warning), or vertices without a face. The error names the element, the count and the remedy.
     """
 
-    surface: Surface | None = None
     source: Source | None = None
+    surface: Surface | None = None
     _joined: tuple[Garment, np.ndarray] | None = None  # a mesh with its seams joined, and where each vertex went [V]
 
     def __init__(self, vertices: Any, faces: Any, *, pins: Any = None, name: str = "", surface: Surface | None = None):
@@ -183,8 +183,8 @@ class Garment:
         an edge has no more than two faces after it; vertices inside a surface never are. Vertices that are not finite
         are removed with their faces; faces with indices out of range, with a vertex twice or without area, and repeated
         faces are removed; where more than two faces share an edge, the largest two stay; neighbours that disagree on
-        the outside are flipped to agree with the majority; vertices without a face are removed. Pins and surface
-        follow their vertices.
+        the outside are flipped to agree with the majority; vertices without a face are removed. Pins and surface follow
+        their vertices; of the surface those polygons stay that have a face left.
 
         Args:
             vertices: Rest positions [m], shape [V,3].
@@ -207,6 +207,7 @@ class Garment:
         new_pins = cleaned.went[given]
         if surface is not None:
             surface.check_vertices(len(cleaned.went))
+            surface = surface.left_of(to_numpy(faces), cleaned.rows, cleaned.corners)
         shown = None if surface is None else surface.renumbered(cleaned.went)
         garment = cls(cleaned.vertices, cleaned.faces, pins=new_pins[new_pins >= 0], name=name, surface=shown)
         _warn(cleaned.message(what))
@@ -232,9 +233,8 @@ class Garment:
 
     def cleaned(self, *, keep: bool = False) -> Garment:
         """A cleaned copy: joins open borders at the same place, such as the two sides of a seam; see `cleaned_from`."""
-        return self.cleaned_from(
-            self.vertices, self.faces, pins=self.pins, name=self.name, keep=keep, surface=self.surface
-        )
+        told: dict[str, Any] = {"pins": self.pins, "name": self.name, "surface": self.surface}
+        return self.cleaned_from(self.vertices, self.faces, **told, keep=keep)
 
     @cached_property
     def simulated(self) -> Simulated:

@@ -112,7 +112,7 @@ class GarmentMotion:
             near = (self.status[int(np.floor(place))], self.status[int(np.ceil(place))])
             worse = max(near, key=lambda status: (not status.finite, status.max_penetration))
             status.append(replace(worse, frame=frame))
-        times = {"start": clock.start, "last": clock.last}
+        times: dict[str, Any] = {"start": clock.start, "last": clock.last}
         return GarmentMotion(vertices, self.faces, clock.fps, status, self.name, **times, surface=self.surface)
 
     def save(self, path: str | os.PathLike) -> None:
@@ -121,7 +121,8 @@ class GarmentMotion:
         - ``.npz``: positions, faces, rate, start [s], status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres; time
           codes are frames, and the first one is `start` x `fps`: 1001 for a shot that starts there;
-        - ``.glb``, ``.gltf``: triangles with a morph target per frame, which an animation shows one after another;
+        - ``.glb``, ``.gltf``: triangles with a morph target per frame, which an animation shows one after another, from
+          `start` on;
         - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it; the
           header says at which frame it starts;
         - no suffix, or a slash at the end: a folder ``frame_1001.obj``, ``frame_1002.obj``, ..., the first number being
@@ -145,8 +146,8 @@ class GarmentMotion:
         from warpgarment.io.files import write_motion
 
         name, extra = self.name or "garment", self._status_arrays()
-        more = {"name": name, "extra": extra, "surface": self.surface}
-        write_motion(path, MotionData.of(self.vertices, self.faces, self.clock, **more))
+        motion = MotionData.of(self.vertices, self.faces, self.clock, name=name, extra=extra, surface=self.surface)
+        write_motion(path, motion)
 
     @classmethod
     def load(
@@ -190,9 +191,8 @@ class GarmentMotion:
                 rows = zip(*columns, verdicts, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
             name = str(data.extra["name"]) if "name" in data.extra else path.stem
-            start = start_of(data, rate)
-            more: dict[str, Any] = {"start": start, "last": data.last, "surface": data.surface}
-            motion = cls(data.vertices, data.faces, rate, status, name, **more)
+            times: dict[str, Any] = {"start": start_of(data, rate), "last": data.last}
+            motion = cls(data.vertices, data.faces, rate, status, name, **times, surface=data.surface)
         except (MeshError, KeyError, ValueError, TypeError) as error:
             raise MeshError(f"{path}: {error}") from None
         said = np.array([not one.finite for one in status] or [False] * motion.frames)

@@ -222,8 +222,8 @@ class Simulator:
                 moved[:given] = brought.given[i]
             clock = motions[on[i]].clock
             last = clock.last if len(moved) == clock.frames else None
-            more = {"start": clock.start, "last": last, "surface": worn.surface}
-            results.append(GarmentMotion(moved, worn.faces, fps, statuses, worn.name, **more))
+            told: dict[str, Any] = {"start": clock.start, "last": last, "surface": worn.surface}
+            results.append(GarmentMotion(moved, worn.faces, fps, statuses, worn.name, **told))
         if shot is not None:
             results = brought_to_shot(states[0].scene, results, on, shot, motions, rates, frames)
         return results[0] if single else results

@@ -101,30 +101,28 @@ def test_several_objects_stay_several_and_are_read_back(tmp_path):
         wg.BodyMotion.load(tmp_path / "frames")
 
 
-def panels(folder):
-    """The skirt as two panels: the vertices of one column are there twice, the polygons behind it name the doubles."""
-    path = dressed.write_obj(folder / "skirt.obj")
-    doubled = [row * dressed.AROUND for row in range(dressed.RINGS)]
-    number = {v: len(VERTICES) + k for k, v in enumerate(doubled)}
-    rows, at = [], 0
-    for line in path.read_text().splitlines():
-        if line.startswith("f "):
-            polygon, at = POLYGONS[at], at + 1
-            last = {v for v, t in zip(polygon.vertices, polygon.coordinates, strict=True) if t % 13 == 12}
-            words = [(number[v] if v in last else v, t) for v, t in
-                     zip(polygon.vertices, polygon.coordinates, strict=True)]  # fmt: skip
-            line = "f " + " ".join(f"{v + 1}/{t + 1}" for v, t in words)
-        rows.append(line)
-    first = next(k for k, row in enumerate(rows) if row.startswith("vt "))
-    rows[first:first] = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in VERTICES[doubled].tolist()]
-    path.write_text("\n".join(rows))
-    return path
+def test_cleaning_keeps_the_polygons_that_it_does_not_drop(tmp_path):
+    """Polygons would name vertices that are no more, or those be written that cleaning has said to drop."""
+    more = [
+        "v {} {} {}".format(*VERTICES[0]),
+        "v 9 9 9",
+        f"f {len(VERTICES) + 1}/1 2/2 14/3",  # where the first quad's half is
+        f"f 1/1 2/2 {len(VERTICES) + 1}/3",  # of two corners, once the double is joined
+    ]
+    with pytest.warns(UserWarning, match="2 of 98 faces are dropped"):
+        garment = load(tmp_path, "\n".join(more), clean=True)
+    assert len(garment.vertices) == len(VERTICES) + 2  # all that were brought, in their order
+    bare = wg.Garment.cleaned_from(garment.vertices, garment.faces, surface=garment.surface)
+    assert len(bare.vertices) == len(VERTICES)
+    for one in (garment, bare):
+        one.save(tmp_path / "a.obj")
+        assert close(dressed.read_obj(tmp_path / "a.obj")[0], expected(VERTICES))
 
 
 def test_seams_that_are_joined_leave_the_polygons_of_the_file(tmp_path):
     """Panels that are simulated as one would come back with polygons that name other vertices than the file's."""
     with pytest.warns(UserWarning, match="joined"):
-        garment = wg.Garment.load(panels(tmp_path), clean=True)
+        garment = wg.Garment.load(dressed.write_panels(tmp_path / "skirt.obj"), clean=True)
     assert len(garment.vertices) == len(VERTICES) + dressed.RINGS
     assert len(garment.simulated.garment.vertices) == len(VERTICES)
     garment.save(tmp_path / "a.obj")
@@ -135,6 +133,35 @@ def test_seams_that_are_joined_leave_the_polygons_of_the_file(tmp_path):
     joined.save(tmp_path / "b.obj")
     assert close(dressed.read_obj(tmp_path / "b.obj")[0], expected(VERTICES))
     np.testing.assert_array_equal(np.sort(joined.surface.corners), np.sort(CORNERS))
+
+
+def test_what_cleaning_turns_round_is_turned_in_the_output(tmp_path):
+    """Polygons would look inwards that the simulation and its normals have outwards; their coordinates would mix."""
+    text = dressed.write_obj(tmp_path / "skirt.obj").read_text().splitlines()
+    at = [k for k, line in enumerate(text) if line.startswith("f ")]
+    for k in at[5::7]:
+        text[k] = " ".join(["f", *reversed(text[k].split()[1:])])
+    (tmp_path / "skirt.obj").write_text("\n".join(text))
+    with pytest.warns(UserWarning, match="turned round"):
+        garment = wg.Garment.load(tmp_path / "skirt.obj", clean=True)
+    garment.save(tmp_path / "a.obj")
+
+    def rolled(found: list) -> list:
+        return [(corners[(k := corners.index(min(corners))) :] + corners[:k], name) for corners, name in found]
+
+    assert rolled(dressed.read_obj(tmp_path / "a.obj")[0]) == rolled(expected(VERTICES))
+
+
+def test_numbers_that_are_none_are_not_handed_on(tmp_path):
+    """A NaN of a damaged file would be in outputs, where other programs stumble over it."""
+    path = dressed.write_obj(tmp_path / "skirt.obj")
+    library = tmp_path / "skirt.mtl"
+    library.write_text(library.read_text().replace("Kd 0.2", "Kd nan").replace("d 1.0", "d 1e400"))
+    garment = wg.Garment.load(path)
+    assert [(m.color is None, m.opacity) for m in garment.surface.materials] == [(True, None), (False, None)]
+    path.write_text(path.read_text().replace("vt 0.5 ", "vt inf "))
+    with pytest.warns(UserWarning, match="5 of 65 texture coordinates are not finite"):
+        assert wg.Garment.load(path).surface is None
 
 
 def test_renumbering_drops_what_is_left_of_polygons():

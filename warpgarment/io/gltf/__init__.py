@@ -111,11 +111,6 @@ def _read_motion(path: Path, options: ReadOptions) -> MotionData:
     return read_gltf(path, mesh=options.mesh)[0]
 
 
-def _write_motion(path: Path, data: MotionData) -> None:
-    say_left_out(path, data.surface, sets=SETS, keeps="materials")
-    write_gltf(path, data)
-
-
 def _holds(path: Path) -> Holds:
     try:
         document = Document(path)
@@ -124,6 +119,11 @@ def _holds(path: Path) -> Holds:
         )
     except Damaged:
         return Holds((), 1.0, "y")
+
+
+def _write_motion(path: Path, data: MotionData) -> None:
+    say_left_out(path, data.surface, sets=SETS, keeps="materials")
+    write_gltf(path, data)
 
 
 FORMAT = Format(None, _read_mesh, _write_mesh, _read_motion, _write_motion, named=True, axis=True, holds=_holds)

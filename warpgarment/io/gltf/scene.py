@@ -134,10 +134,10 @@ class Scene:
                 weights = np.array(still, dtype=np.float64)[None]
             if weights.shape[1] != len(primitive["targets"]):
                 raise Damaged(f"{weights.shape[1]} weights for {len(primitive['targets'])} morph targets")
-            moves = np.stack([_points(self._document.array(target), points.shape[1]) for target in targets])
-            points = points + (weights[:, every] @ moves.reshape(len(moves), -1)).reshape(
-                len(weights), *moves.shape[1:]
-            )
+            points = np.repeat(points, len(weights), axis=0)
+            for k, target in zip(every, targets, strict=True):
+                move, there = _points(self._document.array(target), points.shape[1]), weights[:, k] != 0
+                points[there] += weights[there, k, None, None] * move
         if "skin" in node:
             return self._skinned(points, self._document.item("skins", node["skin"]), attributes)
         matrices = self._matrices(number)

@@ -86,8 +86,9 @@ def write_gltf(path: Path, data: MotionData) -> None:
     }
     if len(vertices) > 1:
         mesh["extras"] = {"targetNames": [f"frame_{k:04d}" for k in range(1, len(vertices))]}
-        fps, start = 30.0 if data.fps is None else data.fps, data.start or 0.0
-        document["animations"] = [_animation(buffer, len(vertices), fps, start)]
+        fps = 30.0 if data.fps is None else data.fps
+        seconds = data.seconds if data.seconds is not None else (data.start or 0.0) / fps
+        document["animations"] = [_animation(path, buffer, len(vertices), fps, seconds)]
     document |= _materials(surface, path.parent)
     document |= {
         "accessors": buffer.accessors,
@@ -142,9 +143,15 @@ def _primitives(buffer: _Buffer, vertices: np.ndarray, faces: np.ndarray, surfac
     return found
 
 
-def _animation(buffer: _Buffer, frames: int, fps: float, start: float) -> dict[str, Any]:
-    """Weights of the morph targets: at each frame that of its own is 1."""
-    times = (max(start, 0.0) + np.arange(frames)) / fps
+def _animation(path: Path, buffer: _Buffer, frames: int, fps: float, start: float) -> dict[str, Any]:
+    """Weights of the morph targets, from the time of the first frame [s] on: at each frame that of its own is 1."""
+    if start < 0:
+        warnings.warn(
+            f"{path}: the motion starts at {start:g} s; times of glTF are 0 or later, so it starts at 0.",
+            UserWarning,
+            stacklevel=6,
+        )
+    times = max(start, 0.0) + np.arange(frames) / fps
     weights = np.eye(frames, dtype=np.float32)[:, 1:].reshape(-1)
     sampler = {"input": buffer.add(times, bounds=True), "output": buffer.add(weights), "interpolation": "LINEAR"}
     return {

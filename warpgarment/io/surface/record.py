@@ -86,7 +86,8 @@ class Surface:
         groups: Groups of the polygons. A name of several words, as in OBJ, is several groups; None: no names.
 
     Raises:
-        MeshError: Arrays of other shapes, or an index out of range.
+        MeshError: Arrays of other shapes, an index out of range, or texture coordinates that are not finite. Colours
+            and opacities that are not are taken for ones that the file does not say.
     """
 
     counts: np.ndarray
@@ -107,13 +108,17 @@ class Surface:
         put("corners", corners)
         sets = []
         for name, values, places in self.coordinates:
-            pairs = np.ascontiguousarray(values, dtype=np.float32)
+            with np.errstate(over="ignore"):
+                pairs = np.ascontiguousarray(values, dtype=np.float32)
             if pairs.ndim != 2 or pairs.shape[1] != 2:
                 raise MeshError(f"texture coordinates of shape {list(pairs.shape)} are no pairs.")
+            bad = np.count_nonzero(~np.isfinite(pairs).all(axis=1))
+            if bad:
+                raise MeshError(f"{bad:,} of {len(pairs):,} texture coordinates are not finite.")
             places = _whole(places, "texture coordinates of corners", NONE, len(pairs), len(corners))
             sets.append(Coordinates(clean_name(name), pairs, places))
         put("coordinates", tuple(sets))
-        put("materials", tuple(m._replace(name=clean_name(m.name)) for m in self.materials))
+        put("materials", tuple(map(_sound, self.materials)))
         put("material", _labels(self.material, len(self.materials), len(counts), "materials"))
         for kind in ("objects", "groups"):
             labels = getattr(self, kind) or Labels((), None)  # type: ignore[arg-type]
@@ -170,6 +175,25 @@ class Surface:
         polygons = np.zeros(len(self.counts), dtype=bool)
         polygons[owner[turned]] = True
         return self.turned(polygons)
+
+    def left_of(self, before: np.ndarray, rows: np.ndarray, after: np.ndarray) -> Surface | None:
+        """The surface of a mesh of which some triangles are left, maybe turned round: polygons with one that is left.
+
+        Args:
+            before: Triangles as they were made of the polygons [F,3].
+            rows: Which of them are left [F'].
+            after: Those [F',3], as `before` has them or turned round.
+
+        Returns:
+            The surface, unchanged where the triangles are not those of the polygons; None where nothing of it is left.
+        """
+        owner = self.polygon_of_triangle
+        if len(before) != len(owner):
+            return self
+        whole = np.array(before)
+        whole[rows] = after
+        found, left = self.following(before, whole), np.bincount(owner[rows], minlength=len(self.counts)) > 0
+        return found if left.all() else found.only(left) if left.any() else None
 
     def only(self, polygons: np.ndarray) -> Surface:
         """Some polygons [P], bool, with the same vertices."""
@@ -318,6 +342,15 @@ def unique_names(names: Sequence[str]) -> list[str]:
         seen[unique] = 0
         found.append(unique)
     return found
+
+
+def _sound(material: Material) -> Material:
+    """A material with a name of one line, without numbers that float32 cannot hold."""
+    name, color, opacity, *_ = material
+    with np.errstate(over="ignore"):
+        color = color if color is not None and np.isfinite(np.array(color, np.float32)).all() else None
+        opacity = opacity if opacity is not None and np.isfinite(np.array(opacity, np.float32)) else None
+    return material._replace(name=clean_name(name), color=color, opacity=opacity)
 
 
 def _whole(array: Any, what: str, least: int, end: int, count: int | None = None) -> np.ndarray:
