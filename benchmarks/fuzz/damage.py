@@ -31,7 +31,9 @@ _SPECIAL: dict[str, tuple[float, ...]] = {
 
 
 def _place(data: bytes, rng: Random) -> int:
-    """A place in a file: half of the time near its beginning, where headers are."""
+    """A place in a file: half of the time near its beginning, where headers are. An empty one has none but 0."""
+    if not data:
+        return 0
     return rng.randrange(min(len(data), 256) if rng.random() < 0.5 else len(data))
 
 
@@ -49,6 +51,8 @@ def cut(data: bytes, rng: Random) -> bytes | None:
 
 def flip(data: bytes, rng: Random) -> bytes | None:
     """Single bits are others."""
+    if not data:
+        return None
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 8, 64))):
         changed[_place(data, rng)] ^= 1 << rng.randrange(8)

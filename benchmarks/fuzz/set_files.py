@@ -351,7 +351,7 @@ def training_state(path: Path) -> Facts:
     for index, values in optimizer.state_dict()["state"].items():
         facts |= {f"{index}.{name}": np.asarray(value) for name, value in values.items()}
     facts |= {name: tensor.numpy() for name, tensor in extra.items()}
-    facts |= {f"recent {k}": np.array(row) for k, row in enumerate(progress["recent"])}
+    facts |= {f"recent {k}": np.array(row) for k, row in enumerate(progress.get("recent", []))}
     return facts | {"step": progress["step"] + 0, "updates": average.updates + 0, "elapsed": progress["elapsed"] + 0.0}
 
 

@@ -62,6 +62,20 @@ def test_damage_follows_from_the_seed(tmp_path):
         assert str(Case.of(text)) == text
 
 
+def test_every_damage_takes_every_file():
+    """The harness itself would end at an empty member of an archive, or at bytes that are no text."""
+    from random import Random
+
+    from benchmarks.fuzz import damage, structure
+
+    special = {change for changes in structure.STRUCTURE.values() for change in changes}
+    for change in {*damage.BYTES, *damage.TEXT, *damage.HARMLESS, *special, *structure.HARMLESS.values()}:
+        for data in (b"", b"\0", b"[1]", b"PK\x01\x02", bytes(300), b"\xff" * 300, b"v 1 2 3\n"):
+            for seed in range(60):
+                made = change(data, Random(seed))
+                assert made is None or isinstance(made, bytes), change.__name__
+
+
 def _write(folder: Path) -> Path:
     (folder / "a.json").write_text("[1, 2, 3]")
     return folder / "a.json"

@@ -155,6 +155,8 @@ def _check_row(row: Mapping[str, Any]) -> None:
     error = row["network"].get("mean_vertex_error_cm")
     if not isinstance(row["sequence"], str) or not isinstance(row["frames"], int):
         raise ValueError("a row that does not name its sequence, or number its frames")
+    if not isinstance(row["network"].get("finite"), bool):
+        raise ValueError(f"the row of {row['sequence'][:60]!r} does not say whether the rollout was finite")
     if error is not None and not is_finite(error):
         raise ValueError(f"the error of {row['sequence'][:60]!r} is no number")
 
