@@ -127,7 +127,10 @@ def test_short_edges_of_one_border_are_not_joined_with_each_other():
 
 
 def test_a_heap_of_triangles_takes_no_time():
-    """A small file with all its triangles in one place would take minutes and gigabytes. 3,000 triangles in 5 s of processor time."""
+    """A small file with all its triangles in one place would take minutes and gigabytes.
+
+    3,000 triangles in 5 s of processor time.
+    """
     vertices = np.random.default_rng(0).normal(0, 1, (9_000, 3))
     began = time.process_time()
     for scattered in (vertices, np.round(vertices, 0)):  # all across each other; some hundred at each place
