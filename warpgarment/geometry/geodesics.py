@@ -302,4 +302,4 @@ class _Unfolding:
         source, half, right, left, seen = windows
         surface = Surface(self.twin, self.apex, self.tail, self.node_of_vertex[self.tail], self.crossed_reach)
         found = segments(surface, source, half, right, left, self.reach)
-        return tuple(np.concatenate(part) for part in zip(seen, found, strict=True))
+        return tuple(np.concatenate(part) for part in zip(seen, found, strict=True))  # type: ignore[return-value]

@@ -2,6 +2,10 @@
 
 A row of a padded view is one garment, or one of its `face_splits` interleaved subsets of faces (section 4.3). Rows of
 similar length share a view, so little is padded, and a batch of one garment many times shares its geodesic weights.
+
+On a CPU larger garments share a view with themselves only. Padding changes the order in which attention adds up, hence
+the last bit; without it a garment in a batch moves as it does alone, bit for bit. Beyond `SMALL` faces that costs no
+time, since padded rows are not computed either.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ TOKENS_PER_VIEW = 131_072  # faces in one call of the network: bounds its activa
 WEIGHTS_PER_VIEW = 2**30  # entries of geodesic weights in one call: 4 GB
 TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps some more, of half the size
 PADDING = 1.25  # rows share a view when the longest has at most this many times the faces of the shortest
+SMALL = 512  # faces of a row up to which others share its view on a CPU too: calls would take longer than padding
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,12 +100,12 @@ def padded_views(
     """
     if not architecture(config.architecture).subsets:
         face_splits = 1
-    groups = row_groups(garments, config, face_splits)
+    groups = row_groups(garments, config, face_splits, cpu=packed.faces.device.type == "cpu")
     return [_view(packed, garments, config, face_splits, group) for group in groups]
 
 
 def row_groups(
-    garments: Sequence[Garment], config: NetworkConfig, face_splits: int
+    garments: Sequence[Garment], config: NetworkConfig, face_splits: int, *, cpu: bool
 ) -> list[list[tuple[int, int, int]]]:
     """Which rows share a view, the longest first; each row is a garment's number, its first face, and how many faces.
 
@@ -108,6 +113,7 @@ def row_groups(
         garments: In the order of the batch.
         config: Of the network.
         face_splits: As `padded_views`.
+        cpu: Whether the network runs on a CPU.
     """
     if face_splits < 1:
         raise ValueError(f"face_splits must be at least 1, got {face_splits}")
@@ -118,7 +124,10 @@ def row_groups(
     for number, garment in enumerate(garments):
         faces = len(garment.faces)
         rows += [(number, s, len(range(s, faces, face_splits))) for s in range(min(face_splits, faces))]
-    rows.sort(key=lambda row: -row[2])
+    occurrence: dict[int, int] = {}
+    for number, garment in enumerate(garments):
+        occurrence.setdefault(id(garment), number)
+    rows.sort(key=lambda row: (-row[2], occurrence[id(garments[row[0]])] if cpu else 0))
 
     groups: list[list[tuple[int, int, int]]] = []
     for row in rows:
@@ -128,6 +137,8 @@ def row_groups(
             entries = kind.entries(garment, longest, config)
             fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
             alike = kind.alike(garment) == kind.alike(first)
+            if cpu and longest > SMALL:
+                alike = alike and garment is first and longest == row[2]
             if fits and alike and longest <= PADDING * row[2]:
                 groups[-1].append(row)
                 continue

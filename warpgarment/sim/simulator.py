@@ -142,6 +142,9 @@ class Simulator:
         network's rate. Garments whose motion is shorter stop earlier; one that stops being finite ends with that frame,
         which holds NaN, with a status that says so and a RuntimeWarning.
 
+        On a CPU the result is repeated bit for bit, and is that of each garment alone if it has more than 512 faces.
+        It may depend on the number of threads in the last bit, which can grow to a millimetre: docs/rounding.md.
+
         Args:
             garment: One or a list.
             body: One, on which all garments are, or a list with one for each garment (which may repeat).
