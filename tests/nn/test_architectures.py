@@ -187,7 +187,8 @@ def test_memory_is_within_its_forecast(kind, number):
         layout = network.layout(garments, packed)
         network.predict(FrameInputs(features, velocities, packed.rest_vertices, body, body), layout)
 
-    forecast = dict(architecture(kind).memory(NetworkSizes(garments, cpu=False), config))
+    forecast = dict(architecture(kind).memory(NetworkSizes(garments, cpu=True), config))
+    forecast.pop("geodesic distances", None)  # they are made up, before the count begins
     passing = max(forecast.pop(name, 0) for name in ("network", "making weights"))
     assert 1 / 1.5 < (sum(forecast.values()) + passing) / allocated(call) < 1.5
 

@@ -19,6 +19,10 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+# CPU libraries add a product of more columns up in another order, so that a garment in a batch would differ from the
+# same garment alone. With more faces than `ALIKE`, the larger product is so much faster that it is taken anyway.
+COLUMNS, ALIKE = 128, 2048
+
 ACTIVATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"relu": F.relu, "gelu": F.gelu}
 
 
@@ -111,7 +115,8 @@ class ManifoldAwareAttention(nn.Module):
 def _spread(weights: torch.Tensor | Spreading, value: torch.Tensor) -> torch.Tensor:
     """Weights times the values of faces; values of velocity tokens are kept. [B,N,N], [B,T,K] -> [B,T,K].
 
-    All manifold heads share their weights, so one product serves them all, and also a batch of one garment.
+    All manifold heads share their weights, so one product serves them all, and also a batch of one garment. On a CPU
+    without gradients, there is one product for every `COLUMNS` values of a face.
     """
     if not isinstance(weights, torch.Tensor):
         return torch.cat([weights.spread(value[:, : weights.faces]), value[:, weights.faces :]], dim=1)
@@ -119,8 +124,14 @@ def _spread(weights: torch.Tensor | Spreading, value: torch.Tensor) -> torch.Ten
     face_value, velocity_value = value[:, :faces], value[:, faces:]
     if weights.shape[0] == 1 and value.shape[0] > 1:
         batch, _, width = face_value.shape
-        flat = face_value.transpose(0, 1).reshape(faces, batch * width)
-        spread = (weights[0] @ flat).reshape(faces, batch, width).transpose(0, 1)
+        together = batch
+        if value.device.type == "cpu" and not torch.is_grad_enabled() and faces <= ALIKE:
+            together = max(1, COLUMNS // width)
+        parts = []
+        for some in face_value.split(together):
+            flat = some.transpose(0, 1).reshape(faces, len(some) * width)
+            parts.append((weights[0] @ flat).reshape(faces, len(some), width).transpose(0, 1))
+        spread = torch.cat(parts) if len(parts) > 1 else parts[0]
     else:
         spread = torch.bmm(weights, face_value)
     return torch.cat([spread, velocity_value], dim=1)
@@ -172,3 +183,24 @@ class EncoderLayer(nn.Module):
 
     def _feed_forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.dropout(self.contract(self.dropout(self.activation(self.expand(x)))))
+
+
+def one_by_one(layer: nn.Linear, tokens: torch.Tensor) -> torch.Tensor:
+    """A linear layer over velocity tokens, such that a garment's result does not depend on the others in the batch.
+
+    Matrix libraries have another kernel for a single row than for several, which adds in another order. A garment of
+    one piece has one velocity token: alone and in a batch its results would differ in the last bit. So on a CPU, where
+    no gradients are asked for, the layer is applied to one token after another.
+
+    Args:
+        layer: The layer, from I to O values.
+        tokens: Shape [R,C,I].
+
+    Returns:
+        Shape [R,C,O].
+    """
+    if tokens.device.type != "cpu" or torch.is_grad_enabled() or tokens.shape[0] * tokens.shape[1] == 1:
+        result: torch.Tensor = layer(tokens)
+        return result
+    rows = [layer(row) for row in tokens.reshape(-1, 1, 1, tokens.shape[-1])]
+    return torch.cat(rows).reshape(*tokens.shape[:-1], -1)

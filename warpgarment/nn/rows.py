@@ -2,6 +2,10 @@
 
 A row of a padded view is one garment, or one of its `face_splits` interleaved subsets of faces (section 4.3). Rows of
 similar length share a view, so there is little padding, and a batch that repeats one garment shares geodesic weights.
+
+On a CPU, larger garments share a view only with copies of themselves. Padding changes the order in which attention adds
+up, hence the last bit; without it a garment in a batch moves as it does alone, bit for bit. Beyond `SMALL` faces that
+costs no time, since padded rows are not computed either.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ TOKENS_PER_VIEW = 131_072  # most faces in one call of the network; bounds its a
 WEIGHTS_PER_VIEW = 2**30  # most entries of geodesic weights in one call, 4 GB
 TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps 1.5 more, of half the size
 PADDING = 1.25  # rows share a view if the longest has at most this many times the faces of the shortest
+SMALL = 512  # most faces of a row that shares its view with others on a CPU too: calls would take longer than padding
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,12 +101,12 @@ def padded_views(
     """
     if not architecture(config.architecture).subsets:
         face_splits = 1
-    groups = row_groups(garments, config, face_splits)
+    groups = row_groups(garments, config, face_splits, cpu=packed.faces.device.type == "cpu")
     return [_view(packed, garments, config, face_splits, group) for group in groups]
 
 
 def row_groups(
-    garments: Sequence[Garment], config: NetworkConfig, face_splits: int
+    garments: Sequence[Garment], config: NetworkConfig, face_splits: int, *, cpu: bool
 ) -> list[list[tuple[int, int, int]]]:
     """Groups rows that share a view, the longest first. A row is (number of its garment, first face, number of faces).
 
@@ -109,6 +114,7 @@ def row_groups(
         garments: The garments, in the order of the batch.
         config: Settings of the network.
         face_splits: Number of subsets, as in `padded_views`.
+        cpu: Whether the network runs on a CPU.
 
     Raises:
         ValueError: `face_splits` is less than 1.
@@ -122,7 +128,10 @@ def row_groups(
     for number, garment in enumerate(garments):
         faces = len(garment.faces)
         rows += [(number, s, len(range(s, faces, face_splits))) for s in range(min(face_splits, faces))]
-    rows.sort(key=lambda row: -row[2])
+    occurrence: dict[int, int] = {}
+    for number, garment in enumerate(garments):
+        occurrence.setdefault(id(garment), number)
+    rows.sort(key=lambda row: (-row[2], occurrence[id(garments[row[0]])] if cpu else 0))
 
     groups: list[list[tuple[int, int, int]]] = []
     for row in rows:
@@ -132,6 +141,8 @@ def row_groups(
             entries = kind.entries(garment, longest, config)
             fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
             alike = kind.alike(garment) == kind.alike(first)
+            if cpu and longest > SMALL:
+                alike = alike and garment is first and longest == row[2]
             if fits and alike and longest <= PADDING * row[2]:
                 groups[-1].append(row)
                 continue

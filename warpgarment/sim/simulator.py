@@ -151,6 +151,9 @@ class Simulator:
         (`Garment.simulated`). Garments whose motion is shorter stop earlier; one that stops being finite ends with that
         frame, which holds NaN, with a status that says so and a RuntimeWarning.
 
+        On a CPU the result is repeated bit for bit, and is that of each garment alone if it has more than 512 faces.
+        It may depend on the number of threads in the last bit, which can grow to a millimetre: docs/rounding.md.
+
         Args:
             garment: One garment, or a list.
             body: One body for all garments, or a list with one for each garment (the same object may repeat).

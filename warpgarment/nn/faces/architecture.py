@@ -85,7 +85,7 @@ class Faces(Architecture):
         """Bytes of geodesic weights, of the distances they are made from (on a CPU), and of a call of the network."""
         garments, stack = sizes.garments, 4 * config.history * FEATURES
         weights, largest, network = 0, 0, 0
-        for group in row_groups(garments, config, sizes.face_splits):
+        for group in row_groups(garments, config, sizes.face_splits, cpu=sizes.cpu):
             length, matrices, pooled = max(count for _, _, count in group), 0, garments[group[0][0]].pools
             if config.manifold_heads:
                 rows = 1 if len({(id(garments[g]), first) for g, first, _ in group}) == 1 else len(group)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from warpgarment.nn.attention import one_by_one
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import NormalisedOutput
 from warpgarment.nn.network import GarmentNetwork
@@ -59,7 +60,7 @@ class ManifoldAwareTransformer(GarmentNetwork):
         faces, kind = x.shape[1], x.device.type
         half = torch.is_autocast_enabled(kind)
         with torch.autocast(kind, enabled=False):  # velocities are differences of frames that bfloat16 would round away
-            tokens = torch.cat([self.embed_faces(x), self.embed_velocity(v)], dim=1)
+            tokens = torch.cat([self.embed_faces(x), one_by_one(self.embed_velocity, v)], dim=1)
         # cast once here, not in every layer, under autocast to half precision
         weights = rows.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
         for layer in self.layers:
@@ -67,4 +68,4 @@ class ManifoldAwareTransformer(GarmentNetwork):
         with torch.autocast(kind, enabled=False):
             tokens = self.final_norm(tokens.to(self.face_head.weight.dtype))
             psi, singular_values = self.face_head(tokens[:, :faces]).split([9, 3], dim=-1)
-            return NormalisedOutput(psi, singular_values, self.velocity_head(tokens[:, faces:]))
+            return NormalisedOutput(psi, singular_values, one_by_one(self.velocity_head, tokens[:, faces:]))

@@ -65,7 +65,7 @@ class PatchesOfCloth(Architecture):
         garments, stack = sizes.garments, 4 * config.history * FEATURES
         stacks = (STACKS[len(garments) > 1],) * 2
         layouts, network = 0, 0
-        for group in row_groups(garments, config, 1):
+        for group in row_groups(garments, config, 1, cpu=sizes.cpu):
             length = max(count for _, _, count in group)
             shared = len({id(garments[g]) for g, _, _ in group}) == 1
             layouts += length * PER_PATCHED_FACE * (1 if shared else len(group))

@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from warpgarment.nn.attention import ACTIVATIONS
+from warpgarment.nn.attention import ACTIVATIONS, one_by_one
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import NormalisedOutput
 from warpgarment.nn.network import GarmentNetwork
@@ -171,7 +171,7 @@ class PatchTransformer(GarmentNetwork):
     ) -> NormalisedOutput:
         """The same as `forward_normalised`, from embedded faces [R,N,F]."""
         with torch.autocast(v.device.type, enabled=False):
-            tokens = self.embed_velocity(self._without_padding(v, component_mask))
+            tokens = one_by_one(self.embed_velocity, self._without_padding(v, component_mask))
         return self._from_embeddings(embedded, tokens, rows, component_mask)
 
     @staticmethod
@@ -198,7 +198,7 @@ class PatchTransformer(GarmentNetwork):
         )
         pooled = pooled.unflatten(0, (batch, patches))
         mean = _rows(weights.pieces, batch).to(pooled.dtype) @ pooled
-        tokens = torch.cat([self.to_patches(pooled), tokens + self.to_velocity(mean)], dim=1)
+        tokens = torch.cat([self.to_patches(pooled), tokens + one_by_one(self.to_velocity, mean)], dim=1)
         kind = faces.device.type
         half = torch.is_autocast_enabled(kind)
         geodesic = weights.weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
@@ -220,7 +220,9 @@ class PatchTransformer(GarmentNetwork):
             precise = self.face_head.weight.dtype
             answer = self.face_head(self.face_norm(faces.to(precise))).unflatten(0, (batch, count))
             psi, singular_values = answer.split([9, 3], dim=-1)
-            return NormalisedOutput(psi, singular_values, self.velocity_head(tokens[:, patches:].to(precise)))
+            return NormalisedOutput(
+                psi, singular_values, one_by_one(self.velocity_head, tokens[:, patches:].to(precise))
+            )
 
     @staticmethod
     def _key_mask(weights: PatchLayout, velocity_mask: torch.Tensor | None, v: torch.Tensor) -> torch.Tensor | None:
