@@ -109,7 +109,7 @@ def tensors(data: bytes, rng: Random) -> bytes | None:
             key = rng.choice(sorted(texts))
             try:
                 texts[key] = json.dumps(any_value(json.loads(texts[key]), rng))
-            except ValueError:
+            except (ValueError, TypeError, RecursionError):
                 texts[key] = rng.choice(("", "x", "[", "9" * 400))
         elif rng.random() < 0.6:
             header = any_value(header, rng)

@@ -163,7 +163,11 @@ class Sequence:
 
     def body(self) -> BodyMotion:
         """The part of the body with which cloth collides (without hands and forearms), with its own vertices only."""
-        return self.full_body().submesh(self.collider_faces)
+        body = self.full_body()
+        try:
+            return body.submesh(self.collider_faces)
+        except MeshError as error:
+            raise MeshError(f"{self.name}: body: {error}") from None
 
     @property
     def collider_faces(self) -> np.ndarray:

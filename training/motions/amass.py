@@ -52,6 +52,7 @@ _UNREADABLE = (
     OSError, ValueError, EOFError, AttributeError, TypeError, KeyError, RuntimeError, TokenError, zipfile.BadZipFile,
     zlib.error,
 )  # fmt: skip
+LARGEST = 1e6  # of an angle [rad] and a position [m]
 _PELVIS = np.array([0.0, -0.22, 0.03])  # rest position of the average body's root [m]; translations start from it
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -73,6 +74,11 @@ def read_amass(path: str | Path) -> Clip:
         raise MeshError(f"{path.name}: trans must be [T,3], T = {len(poses):,} as in poses, got {list(trans.shape)}.")
     checked_finite(poses, path.name)
     checked_finite(trans, path.name)
+    largest = max(float(np.abs(array).max(initial=0.0)) for array in (poses, trans))
+    if largest > LARGEST:
+        raise MeshError(
+            f"{path.name}: a number of {largest:g} in poses or trans, beyond {LARGEST:,.0f}. It is damaged."
+        )
     turns = Rotation.from_rotvec(poses[:, : 3 * len(_JOINTS)].reshape(-1, 3).astype(np.float64)).as_matrix()
     rotations = turns.reshape(len(poses), len(_JOINTS), 3, 3)
     rotations[:, 0] = _Z_UP_TO_Y_UP @ rotations[:, 0]  # the root turns SMPL's axes, Y up, to those of the file, Z up

@@ -21,6 +21,7 @@ from .axes import y_up, z_up
 
 BODY_JOINTS = 22  # number of joints that SMPL and SMPL-H share; SMPL adds two hands, SMPL-H thirty finger joints
 AMASS_JOINTS = 52
+LARGEST = 1e6  # of a rotation [rad] and a translation [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +60,10 @@ class SmplPoses:
                 f"{list(self.rotations.shape)} and {list(self.trans.shape)}."
             )
         for name, array in (("rotations", self.rotations), ("translations", self.trans)):
-            bad = ~np.isfinite(array.reshape(frames, -1)).all(axis=1)
+            bad = ~(np.abs(array.reshape(frames, -1)) <= LARGEST).all(axis=1)  # NaN is not
             if bad.any():
                 raise MeshError(
-                    f"{where}{bad.sum():,} of {frames:,} frames have SMPL {name} that are NaN or infinite "
+                    f"{where}{bad.sum():,} of {frames:,} frames have SMPL {name} that are NaN, infinite or beyond {LARGEST:g} "
                     f"(first: frame {int(np.argmax(bad))}). Leave this sample out."
                 )
 

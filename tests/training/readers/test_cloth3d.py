@@ -13,6 +13,7 @@ from support.readers import QUADS, STRIP, TRIANGLES, mat_file, moving, write_obj
 from warpgarment.errors import MeshError
 from warpgarment.objects.body import BodyMotion
 from warpgarment.training.readers import detect, read_cloth3d, read_pc16, read_recording
+from warpgarment.training.readers.matlab import read_mat
 
 FRAMES = 5
 TRANS = np.arange(3 * FRAMES, dtype=np.float64).reshape(3, FRAMES) / 4.0
@@ -189,3 +190,22 @@ def test_point_caches_of_16_bits_are_exact(tmp_path):
     (tmp_path / "b.pc16").write_bytes(struct.pack("<12siiffi", b"POINTCACHE2\0", 1, -7, 0.0, 1.0, 3))
     with pytest.raises(MeshError, match="version 1 with -7 points"):
         read_pc16(tmp_path / "b.pc16")
+
+
+def test_a_text_whose_dimensions_lie_is_refused(tmp_path):
+    """A size that lies ends the process in SciPy's reader: every number of the dimensions of a text takes others."""
+    data = (write_sample(tmp_path / "a") / "info.mat").read_bytes()
+    path = tmp_path / "info.mat"
+    at = data.index("cotton".encode("utf-16-le")) - 8  # its tag; before that name, dimensions
+    refused = 0
+    for place in range(at - 40, at + 8, 4):
+        for value in (0, 1, 3, 7, 2**31 - 1, 2**31):
+            if data[place : place + 4] != struct.pack("<I", value):
+                path.write_bytes(data[:place] + struct.pack("<I", value) + data[place + 4 :])
+                try:
+                    read_mat(path, ("outfit",))
+                except MeshError:
+                    refused += 1
+    assert refused > 30
+    path.write_bytes(data)
+    assert read_mat(path, ("outfit",))["outfit"]["Top"]["fabric"] == "cotton"
