@@ -22,6 +22,7 @@ from torch import nn
 # CPU libraries add a product of more columns up in another order, so that a garment in a batch would differ from the
 # same garment alone. With more faces than `ALIKE`, the larger product is so much faster that it is taken anyway.
 COLUMNS, ALIKE = 128, 2048
+ALIKE_ON = frozenset({"cpu"})  # kinds of devices on which a garment in a batch gets the bits that it gets alone
 
 ACTIVATIONS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"relu": F.relu, "gelu": F.gelu}
 
@@ -125,7 +126,7 @@ def _spread(weights: torch.Tensor | Spreading, value: torch.Tensor) -> torch.Ten
     if weights.shape[0] == 1 and value.shape[0] > 1:
         batch, _, width = face_value.shape
         together = batch
-        if value.device.type == "cpu" and not torch.is_grad_enabled() and faces <= ALIKE:
+        if value.device.type in ALIKE_ON and not torch.is_grad_enabled() and faces <= ALIKE:
             together = max(1, COLUMNS // width)
         parts = []
         for some in face_value.split(together):
@@ -199,7 +200,7 @@ def one_by_one(layer: nn.Linear, tokens: torch.Tensor) -> torch.Tensor:
     Returns:
         Shape [R,C,O].
     """
-    if tokens.device.type != "cpu" or torch.is_grad_enabled() or tokens.shape[0] * tokens.shape[1] == 1:
+    if tokens.device.type not in ALIKE_ON or torch.is_grad_enabled() or tokens.shape[0] * tokens.shape[1] == 1:
         result: torch.Tensor = layer(tokens)
         return result
     rows = [layer(row) for row in tokens.reshape(-1, 1, 1, tokens.shape[-1])]
