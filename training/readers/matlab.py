@@ -1,8 +1,8 @@
 """MATLAB 5 files as plain dictionaries.
 
 SciPy reads them, and trusts what is inside: a size that lies can end the process. So the variables that are wanted are
-walked through first, after "MAT-File Format", The MathWorks, chapter 1: every element lies within the one around it, and
-every array has as many numbers or letters as its dimensions say.
+walked through first, after "MAT-File Format", The MathWorks, chapter 1: every element lies within the one around it,
+and every array has as many numbers or letters as its dimensions say.
 """
 
 from __future__ import annotations

@@ -63,8 +63,8 @@ class SmplPoses:
             bad = ~(np.abs(array.reshape(frames, -1)) <= LARGEST).all(axis=1)  # NaN is not
             if bad.any():
                 raise MeshError(
-                    f"{where}{bad.sum():,} of {frames:,} frames have SMPL {name} that are NaN, infinite or beyond {LARGEST:g} "
-                    f"(first: frame {int(np.argmax(bad))}). Leave this sample out."
+                    f"{where}{bad.sum():,} of {frames:,} frames have SMPL {name} that are NaN, infinite or beyond "
+                    f"{LARGEST:,.0f} (first: frame {int(np.argmax(bad))}). Leave this sample out."
                 )
 
     def __len__(self) -> int:
