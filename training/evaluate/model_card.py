@@ -120,9 +120,9 @@ def read_evaluation(path: Path, config: Mapping[str, Any], notes: Mapping[str, A
             _check_figures(row)
         if not isinstance(result.get("frames_predicted", 0), int):
             raise ValueError("a number of frames that is none")
-        rows = [row for row in result["sequences"] if row["start"] == "cold" and row["network"] is not None]
-        for row in rows:
+        for row in result["sequences"]:
             _check_row(row)
+        rows = [row for row in result["sequences"] if row["start"] == "cold"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CardError(f"{path}: no result of an evaluation ({type(error).__name__}: {error})") from error
     # A setting that was introduced later has its default value in older files.
@@ -144,12 +144,16 @@ def _objects(*parts: object) -> None:
 
 def _check_figures(figures: object) -> None:
     """Raises ValueError unless these are numbers by name."""
-    if not isinstance(figures, dict) or not all(v is None or isinstance(v, (int, float)) for v in figures.values()):
+    known = isinstance(figures, dict) and all(
+        v is None or isinstance(v, bool) or is_finite(v) for v in figures.values()
+    )
+    if not known:
         raise ValueError("figures that are no numbers")
 
 
 def _check_row(row: Mapping[str, Any]) -> None:
     """Raises ValueError where a row of an evaluation holds something else than the page shows."""
+    _objects(row, row["network"])
     for method in METHODS:
         _check_figures(row.get(method, {}))
     error = row["network"].get("mean_vertex_error_cm")

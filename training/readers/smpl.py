@@ -64,7 +64,7 @@ class SmplPoses:
             if bad.any():
                 raise MeshError(
                     f"{where}{bad.sum():,} of {frames:,} frames have SMPL {name} that are NaN, infinite or beyond "
-                    f"{LARGEST:g} (first: frame {int(np.argmax(bad))}). Leave this sample out."
+                    f"{LARGEST:,.0f} (first: frame {int(np.argmax(bad))}). Leave this sample out."
                 )
 
     def __len__(self) -> int:
