@@ -188,7 +188,8 @@ class GarmentMotion:
             if "status_finite" in data.extra:
                 verdicts = [Verdict(str(v)) for v in data.extra["status_verdict"]]
                 columns = [data.extra[f"status_{key}"].tolist() for key in _STATUS]
-                rows = zip(*columns, verdicts, strict=True)
+                met = [_optional(data.extra.get(f"status_{key}"), kind, len(verdicts)) for key, kind in _MET.items()]
+                rows = zip(*columns, verdicts, *met, strict=True)
                 status = [RolloutStatus(*row) for row in rows]
             name = str(data.extra["name"]) if "name" in data.extra else path.stem
             times: dict[str, Any] = {"start": start_of(data, rate), "last": data.last}
@@ -211,8 +212,18 @@ class GarmentMotion:
         if self.status:
             for key in _STATUS:
                 arrays[f"status_{key}"] = np.array([getattr(s, key) for s in self.status])
+            for key in _MET:
+                values = [getattr(s, key) for s in self.status]
+                if any(value is not None for value in values):
+                    arrays[f"status_{key}"] = np.array([np.nan if v is None else v for v in values], np.float64)
             arrays["status_verdict"] = np.array([s.verdict.value for s in self.status])
         return arrays
 
 
+def _optional(values: np.ndarray | None, kind: type, count: int) -> list[Any]:
+    """Numbers of a figure that may be missing, with None for NaN or where there is no array."""
+    return [None] * count if values is None else [None if np.isnan(v) else kind(v) for v in values]
+
+
+_MET = {"layer_crossings": int, "self_crossings": int, "lag": float}  # figures that are None where not measured
 _STATUS = ("frame", "finite", "max_penetration", "poisson_iterations", "collision_iterations")

@@ -14,6 +14,7 @@ class Verdict(enum.Enum):
 
     OK = "ok"
     PENETRATING = "penetrating"
+    CROSSING = "crossing"
     NOT_FINITE = "not finite"
 
     @property
@@ -27,6 +28,10 @@ _MESSAGES = {
     Verdict.PENETRATING: (
         "Part of the garment is deep in the body. Start from a garment outside it (wg.fit), raise collision_passes, "
         "or drop squeezed parts such as hands with BodyMotion.submesh."
+    ),
+    Verdict.CROSSING: (
+        "Triangles of the garment cross each other or another garment of its outfit. What crosses in the first frame "
+        "goes on crossing: start from garments that lie over each other, innermost first in `layers`."
     ),
     Verdict.NOT_FINITE: (
         "The garment holds NaN or infinite positions from this frame on. Check that the garment and the body are in "
@@ -50,6 +55,12 @@ class RolloutStatus:
         collision_iterations: Number of conjugate gradient iterations of the collision refinement, the largest of all
             components, summed over the passes.
         verdict: Judgement that follows from these figures.
+        layer_crossings: Number of pairs of triangles, one of this garment and one of another of its outfit, that cross.
+            None if they were not counted, or not all of them: a garment of no outfit, or cloth so crumpled that some
+            pairs were not looked at.
+        self_crossings: Number of pairs of triangles of this garment, without a common vertex, that cross; or None.
+        lag: How far the vertex that stayed behind most, so as not to cross cloth, is from where it should be [m]; None
+            if nothing held it, as in the first frame.
     """
 
     frame: int
@@ -58,6 +69,9 @@ class RolloutStatus:
     poisson_iterations: int
     collision_iterations: int
     verdict: Verdict
+    layer_crossings: int | None = None
+    self_crossings: int | None = None
+    lag: float | None = None
 
     @classmethod
     def judged(
@@ -68,6 +82,9 @@ class RolloutStatus:
         poisson_iterations: int = 0,
         collision_iterations: int = 0,
         *,
+        layer_crossings: int | None = None,
+        self_crossings: int | None = None,
+        lag: float | None = None,
         tolerance: float = PENETRATION_TOLERANCE,
     ) -> RolloutStatus:
         """A status whose verdict follows from its figures; `tolerance` is the largest acceptable depth [m]."""
@@ -75,7 +92,19 @@ class RolloutStatus:
             verdict = Verdict.NOT_FINITE
         else:
             verdict = Verdict.PENETRATING if max_penetration > tolerance else Verdict.OK
-        return cls(frame, finite, max_penetration, poisson_iterations, collision_iterations, verdict)
+            if verdict is Verdict.OK and (layer_crossings or self_crossings):
+                verdict = Verdict.CROSSING
+        return cls(
+            frame,
+            finite,
+            max_penetration,
+            poisson_iterations,
+            collision_iterations,
+            verdict,
+            layer_crossings,
+            self_crossings,
+            lag,
+        )
 
     @property
     def message(self) -> str:

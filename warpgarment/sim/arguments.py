@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -102,6 +102,43 @@ def known_frames(
             raise MeshError(f"{name} of garment {number} holds NaN or infinity; repair what wrote it")
         parts.append(array.reshape(-1, len(garment.vertices), 3))
     return np.concatenate(parts, axis=1)
+
+
+Layers: TypeAlias = bool | Sequence[Sequence[int]] | None
+
+
+def outfits(layers: Layers, body_of_garment: Sequence[int]) -> list[list[int]]:
+    """The outfits of a batch: lists of numbers of garments, innermost first.
+
+    Args:
+        layers: None or False for no outfit; True for one on each body, in the order of the batch; or the outfits.
+        body_of_garment: Number of the body of each garment.
+
+    Raises:
+        ValueError: An outfit is empty, or names a garment that does not exist, is in an outfit already, or is on
+            another body than the rest of the outfit.
+    """
+    if layers is None or layers is False:
+        return []
+    if layers is True:
+        on_body: dict[int, list[int]] = {}
+        for garment, body in enumerate(body_of_garment):
+            on_body.setdefault(body, []).append(garment)
+        return list(on_body.values())
+    found = [[int(garment) for garment in outfit] for outfit in layers]
+    seen: set[int] = set()
+    for number, outfit in enumerate(found):
+        if not outfit:
+            raise ValueError(f"outfit {number} of layers is empty")
+        for garment in outfit:
+            if not 0 <= garment < len(body_of_garment):
+                raise ValueError(f"layers name garment {garment}; there are {len(body_of_garment)}, from 0")
+            if garment in seen:
+                raise ValueError(f"layers name garment {garment} twice; a garment is worn in one outfit")
+            seen.add(garment)
+        if len({body_of_garment[garment] for garment in outfit}) > 1:
+            raise ValueError(f"the garments {outfit} of outfit {number} are on different bodies; give them one")
+    return found
 
 
 def counted(frames: range, progress: bool) -> Any:

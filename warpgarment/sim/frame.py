@@ -21,6 +21,7 @@ class Frame(NamedTuple):
     solves: (
         torch.Tensor
     )  # float64 [2,3]: for Poisson and collisions, iterations, number of stopped components, their largest error
+    meeting: torch.Tensor  # [B,4] figures of cloth that meets cloth, see `stages.meet.FIGURES`; NaN for no outfit
 
     @property
     def history(self) -> History:
@@ -30,4 +31,4 @@ class Frame(NamedTuple):
     @property
     def outcome(self) -> tuple[torch.Tensor, ...]:
         """The tensors that `recording.read` copies to the host."""
-        return self.positions, self.finite, self.depth, self.solves
+        return self.positions, self.finite, self.depth, self.solves, self.meeting

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from warpgarment.errors import NotEnoughMemory
+from warpgarment.kernels.cloth.pairs import PARTNERS
 from warpgarment.kernels.collision import compliance
 from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.kernels.linear import factor
@@ -34,6 +35,7 @@ from warpgarment.sim.stages.correct import Corrector
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
 PER_BODY_FACE, PER_BODY_VERTEX = 400, 60  # bytes of the search tree with winding numbers; of positions in two frames
+PER_MEETING_FACE = PARTNERS * (4 + 3 * 12) + 200  # bytes of pairs and their directions, and of boxes and a tree
 GRAPHED = 3  # copies of the history on a GPU: of a state, and the input and output of a graph
 INVERTING = 3  # number of float64 matrices while the compliance of a component is made
 LANES = 16  # rows of compliance matrices are padded to a multiple of this
@@ -68,6 +70,7 @@ def predict(
     half: bool = False,
     device: torch.device | str = "cpu",
     correctors: Sequence[Corrector] = (),
+    layers: Sequence[Sequence[int]] = (),
 ) -> Memory:
     """Predicts the peak memory of a batch on its device.
 
@@ -79,6 +82,7 @@ def predict(
         half: Whether the network runs in bfloat16, as in `Simulator`.
         device: Device of the simulation; on a CPU, the distances from which weights are made count too.
         correctors: Correctors of the simulation, each of which predicts its own memory.
+        layers: Garments of each outfit, as numbers in the batch.
 
     Returns:
         Bytes by purpose. The prediction itself allocates no arrays over pairs of faces.
@@ -105,6 +109,7 @@ def predict(
             "factors of the solvers": _factors(unique, cpu),
             "history of features": (1 if cpu else GRAPHED) * 4 * config.history * FEATURES * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
+            "pairs of layers": PER_MEETING_FACE * sum(len(garments[i].faces) for outfit in layers for i in outfit),
             "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
             peak: passing[peak],
         }
@@ -134,6 +139,7 @@ def check(
     half: bool = False,
     device: torch.device | str = "cpu",
     correctors: Sequence[Corrector] = (),
+    layers: Sequence[Sequence[int]] = (),
 ) -> None:
     """Checks that a batch fits on its device, before memory is allocated. The arguments are those of `predict`.
 
@@ -147,7 +153,16 @@ def check(
 
     def needs(number: int = len(garments), splits: int = face_splits, halved: bool = half) -> Memory:
         given = garments[:number]
-        return predict(given, bodies, config, face_splits=splits, half=halved, device=device, correctors=correctors)
+        return predict(
+            given,
+            bodies,
+            config,
+            face_splits=splits,
+            half=halved,
+            device=device,
+            correctors=correctors,
+            layers=[[i for i in outfit if i < number] for outfit in layers],
+        )
 
     needed = needs()
     if needed.total <= limit:

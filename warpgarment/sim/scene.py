@@ -26,6 +26,7 @@ from warpgarment.sim.stages.centroids import ComponentCentroids
 from warpgarment.sim.stages.contact import Contact
 from warpgarment.sim.stages.correct import Correct, Corrector
 from warpgarment.sim.stages.features import Features
+from warpgarment.sim.stages.meet import Meet
 from warpgarment.sim.stages.reconstruct import Reconstruct
 
 from . import memory
@@ -54,6 +55,7 @@ class Scene:
         contact_sources: Objects that find contacts, such as `BodyContacts()`.
         correctors: What changes positions after contact.
         brought: What users brought, where it is more than `garments`.
+        layers: Garments of each outfit, innermost first, as numbers in the batch; see `arguments.outfits`.
 
     Attributes:
         contact_sources: List of contact sources; more may be appended before the first frame.
@@ -81,6 +83,7 @@ class Scene:
         contact_sources: Sequence[ContactSource] = (BodyContacts(),),
         correctors: Sequence[Corrector] = (),
         brought: Brought | None = None,
+        layers: Sequence[Sequence[int]] = (),
     ) -> None:
         if network.reads:
             raise ValueError(f"the network reads {', '.join(sorted(network.reads))}, which simulations do not give yet")
@@ -95,6 +98,7 @@ class Scene:
             half=half,
             device=device,
             correctors=self.correctors,
+            layers=layers,
         )
         self.brought, self.topology = brought, bodies
         self.packed = packed = PackedGarments.pack(garments, device)
@@ -128,6 +132,7 @@ class Scene:
             passes=collision_passes,
             timings=timings,
         )
+        self.meet = Meet(packed, layers, first_vertices, timings)
         self.correct = Correct(self.correctors, packed, self.contact.depth, timings)
 
     def _refuse_far(self, vertices: torch.Tensor, body_of_vertex: torch.Tensor) -> None:

@@ -29,7 +29,7 @@ from warpgarment.objects.status import RolloutStatus
 from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
-from .arguments import as_array, counted, known_frames, listed, per_garment
+from .arguments import Layers, as_array, counted, known_frames, listed, outfits, per_garment
 from .brought import Brought
 from .frame import Frame
 from .graph import GraphedFrames
@@ -114,6 +114,7 @@ class Simulator:
         frames: int | None = None,
         out_fps: Rate = None,
         face_splits: int = 1,
+        layers: Layers = None,
         progress: bool = False,
     ) -> GarmentMotion: ...
 
@@ -128,6 +129,7 @@ class Simulator:
         frames: int | None = None,
         out_fps: Rate = None,
         face_splits: int = 1,
+        layers: Layers = None,
         progress: bool = False,
     ) -> list[GarmentMotion]: ...
 
@@ -141,6 +143,7 @@ class Simulator:
         frames: int | None = None,
         out_fps: Rate = None,
         face_splits: int = 1,
+        layers: Layers = None,
         progress: bool = False,
     ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
@@ -167,14 +170,18 @@ class Simulator:
                 body at that time, and measured.
             face_splits: Number of interleaved subsets of the faces that the network sees one at a time. More subsets
                 take less time and memory.
+            layers: Which garments are worn together, and so kept from crossing each other and themselves. None: the
+                garments of a list are independent of each other. True: all garments on the same body are one outfit,
+                in the order of the list, innermost first; a single garment is kept from crossing itself. Or a list of
+                outfits, each a list of numbers of garments, innermost first, such as `[[0, 1], [2, 3, 4]]`.
             progress: Whether to show a progress bar.
 
         Returns:
             A `GarmentMotion`, or a list of them for a list of garments.
 
         Raises:
-            ValueError: Lists have different lengths, arrays have other shapes, or both `first_vertices` and `history`
-                are given.
+            ValueError: Lists have different lengths, arrays have other shapes, both `first_vertices` and `history`
+                are given, or `layers` name a garment that does not exist, twice, or on another body.
             MeshError: A garment is more than 1 m from its body, or positions are not finite.
             NotEnoughMemory: The batch would not fit on the device; the message names settings with which it would.
             UsageError: `frames` is less than 1.
@@ -207,7 +214,7 @@ class Simulator:
             self.device,
         )
         first = [body_at(frame) for frame in range(given)]
-        states = self._begin(brought, single, packed, first, face_splits)
+        states = self._begin(brought, single, packed, first, face_splits, outfits(layers, on))
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         with evaluating(self.network):
@@ -233,7 +240,14 @@ class Simulator:
 
     @overload
     def start(
-        self, garment: Garment, body_vertices: Any, body_faces: Any, *, first_vertices: Any = None, face_splits: int = 1
+        self,
+        garment: Garment,
+        body_vertices: Any,
+        body_faces: Any,
+        *,
+        first_vertices: Any = None,
+        face_splits: int = 1,
+        layers: Layers = None,
     ) -> SimulationState[np.ndarray, RolloutStatus]: ...
 
     @overload
@@ -245,6 +259,7 @@ class Simulator:
         *,
         first_vertices: Any = None,
         face_splits: int = 1,
+        layers: Layers = None,
     ) -> SimulationState[list[np.ndarray], list[RolloutStatus]]: ...
 
     def start(
@@ -255,6 +270,7 @@ class Simulator:
         *,
         first_vertices: Any = None,
         face_splits: int = 1,
+        layers: Layers = None,
     ) -> SimulationState[Any, Any]:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
@@ -264,6 +280,7 @@ class Simulator:
             body_faces: Vertex indices of its faces, shape [G,3]; a list if `body_vertices` is one.
             first_vertices: Positions in the first frame, as in `rollout`.
             face_splits: Number of subsets of the faces, as in `rollout`.
+            layers: Which garments are worn together, as in `rollout`.
 
         Returns:
             The state at frame 0.
@@ -287,7 +304,7 @@ class Simulator:
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
         brought = self._brought(garments, single, first_vertices, None)
         first = self._positions([b.vertices[0] for b in checked])
-        return self._begin(brought, single, packed, [first], face_splits)[0]
+        return self._begin(brought, single, packed, [first], face_splits, outfits(layers, on))[0]
 
     def step(
         self, state: SimulationState[Vertices, Status], next_body_vertices: Any
@@ -323,6 +340,7 @@ class Simulator:
         bodies: PackedBodies,
         body_frames: list[torch.Tensor],
         face_splits: int,
+        layers: list[list[int]],
     ) -> list[SimulationState[Any, Any]]:
         """States of the known frames: one for a cold start, H with a history."""
         garments, known = brought.simulated, torch.from_numpy(brought.known).to(self.device)
@@ -340,6 +358,7 @@ class Simulator:
             contact_sources=self.contact_sources,
             correctors=self.correctors,
             brought=brought,
+            layers=layers,
         )
         history_length = self.network.config.history
         features = scene.features(known[0], body_frames[0], body_frames[0])
@@ -354,7 +373,8 @@ class Simulator:
                 velocity = scene.centroids(vertices) - scene.centroids(known[frame - 1])
                 history = history.followed(history.stacked(features), velocity)
             depth = scene.contact.depth(vertices, body)
-            now = Frame(vertices, body, history.features, history.velocities, finite, depth, unsolved)
+            met = scene.meet.measure(vertices, finite)
+            now = Frame(vertices, body, history.features, history.velocities, finite, depth, unsolved, met)
             states.append(SimulationState(scene, single, frame, now, graph))
         return states
 

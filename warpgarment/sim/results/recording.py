@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
         first: Number of the first frame.
         frames: `seen` of this and the following frames.
     """
-    positions, finite, depth, solves, *body = (
+    positions, finite, depth, solves, meeting, *body = (
         torch.stack(tensors).cpu().numpy() for tensors in zip(*frames, strict=True)
     )
     brought, found = scene.brought, []
@@ -46,8 +46,8 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
                 part[:] = np.nan
         _warn_if_stopped(scene, solves[k])
         iterations = [int(n) for n in solves[k, :, 0]]
-        judged = zip(finite[k], depth[k], strict=True)
-        statuses = [RolloutStatus.judged(first + k, bool(f), float(d), *iterations) for f, d in judged]
+        judged = zip(finite[k], depth[k], meeting[k], strict=True)
+        statuses = [RolloutStatus.judged(first + k, bool(f), float(d), *iterations, **_met(m)) for f, d, m in judged]
         found.append(Outcome(parts, statuses, bool(finite[k].any())))
     return found
 
@@ -56,6 +56,17 @@ def seen(scene: Scene, frame: Frame) -> tuple[torch.Tensor, ...]:
     """What `read` reads of a frame: its outcome, and the bodies where vertices are carried that may be inside them."""
     rides = scene.brought is not None and scene.brought.rides
     return (*frame.outcome, frame.body) if rides else frame.outcome
+
+
+def _met(figures: np.ndarray) -> dict[str, Any]:
+    """Crossing pairs and lag of a garment as `RolloutStatus` has them, from its row of `stages.meet.FIGURES`."""
+    layers, itself, lag, unseen = figures
+    counted = unseen == 0  # not for NaN
+    return {
+        "layer_crossings": int(layers) if counted else None,
+        "self_crossings": int(itself) if counted else None,
+        "lag": float(lag) if lag >= 0 else None,
+    }
 
 
 def _warn_if_stopped(scene: Scene, solves: np.ndarray) -> None:

@@ -85,7 +85,8 @@ def brought_to_shot(
     """Results at other rates than the network's.
 
     Positions are interpolated in a straight line in time. Between two frames of the network they are then moved out of
-    the body as it is in the shot, by the contact stage of the simulation, and the depth is measured there.
+    the body as it is in the shot, by the contact stage of the simulation, and the depth is measured there. Garments of
+    an outfit may cross between two frames of the network; such pairs are counted, not moved apart.
 
     Args:
         scene: The scene of the rollout.
@@ -113,7 +114,8 @@ def brought_to_shot(
         cloth = _tensor(parts if scene.brought is None else [scene.brought.reduced(parts)], pending.device)
         body = _tensor(shown, pending.device)
         moved, finite, depth, report = scene.contact(cloth, body, pending)
-        tensors = (moved, finite, depth, torch.stack([torch.zeros_like(report), report]))
+        solves = torch.stack([torch.zeros_like(report), report])
+        tensors = (moved, finite, depth, solves, scene.meet.measure(moved, finite))
         rides = scene.brought is not None and scene.brought.rides
         outcome = read(scene, frame, [(*tensors, body) if rides else tensors])[0]
         for i in np.flatnonzero(moving):
