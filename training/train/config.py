@@ -24,8 +24,8 @@ class TrainConfig:
     Attributes:
         data: Folder of sequences.
         out: Folder for all output of the run.
-        network: Named shape of the network; "fast" is a network of patches of cloth, the others have a token for every
-            face.
+        network: Named shape of the network; "fast" is a network of patches of cloth, "layersnet" one for layered
+            outfits in the wind ("layersnet-paper" in its published form), the others have a token for every face.
         overrides: Changes to that shape, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
         init: Checkpoint to start from instead of random weights; its shape and statistics are kept. A file, a folder,
             or the name of a network that ships. A network of patches can also start from one of faces with the same
@@ -63,7 +63,7 @@ class TrainConfig:
 
     data: Path
     out: Path
-    network: Literal["small", "base", "fast"] = "small"
+    network: Literal["small", "base", "fast", "layersnet", "layersnet-paper"] = "small"
     overrides: tuple[str, ...] = ("dropout=0.0",)
     init: Path | None = None
     grow: bool = False

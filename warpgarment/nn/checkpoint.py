@@ -24,7 +24,7 @@ from warpgarment.io.disk.atomic import atomic_file
 from . import hub, shards
 from .architecture import ARCHITECTURES, architecture, build_network
 from .bounds import check_settings, checked_json
-from .config import STATISTICS, NetworkConfig
+from .config import NetworkConfig
 from .device import device_of
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def save(
         raise ValueError(f"dtype must be one of {', '.join(str(d)[6:] for d in _DTYPES)}, got {str(dtype)[6:]}")
     tensors = {}
     for name, tensor in network.state_dict().items():
-        tensor = tensor.detach().to("cpu", torch.float32 if name in STATISTICS else dtype).contiguous()
+        tensor = tensor.detach().to("cpu", torch.float32 if name in network.statistics else dtype).contiguous()
         if not torch.isfinite(tensor).all():
             raise CheckpointError(f"{name} is not finite in {str(dtype)[6:]}; nothing was written to {path}")
         tensors[name] = tensor
@@ -126,7 +126,7 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
             raise CheckpointError(f"{path}: {name} is {str(tensor.dtype)[6:]}, expected a floating-point tensor")
         if not torch.isfinite(tensor).all():
             raise CheckpointError(f"{path}: {name} is not finite; the network was saved after training had diverged")
-        if name.endswith("_std") and name in STATISTICS and (tensor <= 0).any():
+        if name.endswith("_std") and name in network.statistics and (tensor <= 0).any():
             raise CheckpointError(f"{path}: {name} must be positive, smallest is {tensor.min().item():g}")
     network.load_state_dict(tensors)
     return network.to(device or "cpu").eval()

@@ -39,9 +39,11 @@ class GarmentNetwork(nn.Module):
     Attributes:
         reads: Names of the optional fields of `FrameInputs` that `predict` needs: `previous`, `materials`, `wind`,
             `pairs`.
+        statistics: Buffers of the normalisation and their lengths.
     """
 
     reads: ClassVar[frozenset[str]] = frozenset()
+    statistics: ClassVar[Mapping[str, int]] = STATISTICS
 
     face_head: nn.Linear
     velocity_head: nn.Linear
@@ -60,12 +62,13 @@ class GarmentNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.channels = FACE.only(config.channels)
-        for name, length in STATISTICS.items():
+        for name, length in self.statistics.items():
             length = self.channels.width if name.startswith("feature_") else length
             start = torch.zeros(length) if name.endswith("_mean") else torch.ones(length)
             self.register_buffer(name, start)
-        self.psi_mean.copy_(torch.eye(3).flatten())
-        self.singular_value_mean.fill_(1.0)
+        if "psi_mean" in self.statistics:
+            self.psi_mean.copy_(torch.eye(3).flatten())
+            self.singular_value_mean.fill_(1.0)
 
     def encoder_layers(self) -> nn.ModuleList:
         """Untrained encoder layers on tokens of width `config.embedding`."""
@@ -227,7 +230,7 @@ class GarmentNetwork(nn.Module):
         """Replaces statistics of the normalisation.
 
         Args:
-            statistics: Values by name, any of `STATISTICS` and of the length given there. They describe inputs in the
+            statistics: Values by name, any of the attribute `statistics` and of the length given there. They describe inputs in the
                 canonical frame, and targets from `parametrisation.targets` in the canonical frame.
 
         Raises:
@@ -235,8 +238,8 @@ class GarmentNetwork(nn.Module):
                 or an output mean of a residual network that is not "moves like skin".
         """
         for name, value in statistics.items():
-            if name not in STATISTICS:
-                raise ValueError(f"unknown statistic {name!r}; there are {', '.join(STATISTICS)}")
+            if name not in self.statistics:
+                raise ValueError(f"unknown statistic {name!r}; there are {', '.join(self.statistics)}")
             value = torch.as_tensor(value, dtype=torch.float32)
             length = len(getattr(self, name))
             if tuple(value.shape) != (length,):

@@ -33,6 +33,7 @@ from .arguments import as_array, counted, known_frames, listed, per_garment
 from .frame import Frame
 from .graph import GraphedFrames
 from .history import History
+from .outdoors import Materials, as_materials, as_wind
 from .recording import READ_EVERY, Recording
 from .scene import Scene
 from .state import SimulationState, Status, Vertices
@@ -112,6 +113,8 @@ class Simulator:
         frames: int | None = None,
         face_splits: int = 1,
         progress: bool = False,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> GarmentMotion: ...
 
     @overload
@@ -125,6 +128,8 @@ class Simulator:
         frames: int | None = None,
         face_splits: int = 1,
         progress: bool = False,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> list[GarmentMotion]: ...
 
     def rollout(
@@ -137,6 +142,8 @@ class Simulator:
         frames: int | None = None,
         face_splits: int = 1,
         progress: bool = False,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
@@ -155,13 +162,16 @@ class Simulator:
             face_splits: Number of interleaved subsets of the faces that the network sees one at a time. More subsets
                 take less time and memory.
             progress: Whether to show a progress bar.
+            materials: Material of all garments, or a list with one, or None, for each; for networks that read them.
+            wind: Velocity of the air [m/s], shape [3], [T,3] or [T,B,3], at the network's rate; the last row holds on.
+                For networks that read it.
 
         Returns:
             A `GarmentMotion` at the network's rate, or a list of them for a list of garments.
 
         Raises:
-            ValueError: Lists have different lengths, arrays have other shapes, or both `first_vertices` and `history`
-                are given.
+            ValueError: Lists have different lengths, arrays have other shapes, both `first_vertices` and `history` are
+                given, or `materials` or `wind` for a network that does not read them.
             MeshError: A garment is more than 1 m from its body, or positions are not finite.
             NotEnoughMemory: The batch would not fit on the device; the message names settings with which it would.
             UsageError: `frames` is less than 1.
@@ -189,12 +199,19 @@ class Simulator:
             self.device,
         )
         first = [body_at(frame) for frame in range(given)]
-        states = self._begin(garments, single, packed, known, first, face_splits)
+        known_materials = as_materials(materials, len(garments), self.network, self.device)
+        blown = as_wind(wind, len(garments), self.network)
+
+        def wind_at(frame: int) -> torch.Tensor | None:
+            return None if blown is None else self._positions(list(blown[[min(max(frame, 0), len(blown) - 1)]]))
+
+        blowing = [(wind_at(frame), wind_at(frame - 1)) for frame in range(given)]
+        states = self._begin(garments, single, packed, known, first, face_splits, known_materials, blowing)
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         with evaluating(self.network):
             for frame in counted(range(total), progress):
-                state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
+                state = self._advance(state, body_at(frame), wind_at(frame)) if frame >= given else states[frame]
                 if not recording.add(state.now.outcome, last=frame == total - 1):
                     break
         results = []
@@ -208,7 +225,15 @@ class Simulator:
 
     @overload
     def start(
-        self, garment: Garment, body_vertices: Any, body_faces: Any, *, first_vertices: Any = None, face_splits: int = 1
+        self,
+        garment: Garment,
+        body_vertices: Any,
+        body_faces: Any,
+        *,
+        first_vertices: Any = None,
+        face_splits: int = 1,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> SimulationState[np.ndarray, RolloutStatus]: ...
 
     @overload
@@ -220,6 +245,8 @@ class Simulator:
         *,
         first_vertices: Any = None,
         face_splits: int = 1,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> SimulationState[list[np.ndarray], list[RolloutStatus]]: ...
 
     def start(
@@ -230,6 +257,8 @@ class Simulator:
         *,
         first_vertices: Any = None,
         face_splits: int = 1,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> SimulationState[Any, Any]:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
@@ -239,6 +268,8 @@ class Simulator:
             body_faces: Vertex indices of its faces, shape [G,3]; a list if `body_vertices` is one.
             first_vertices: Positions in the first frame, as in `rollout`.
             face_splits: Number of subsets of the faces, as in `rollout`.
+            materials: Materials, as in `rollout`.
+            wind: Velocity of the air in the first frame [m/s], shape [3], or [1,B,3] with one for each garment.
 
         Returns:
             The state at frame 0.
@@ -262,16 +293,21 @@ class Simulator:
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
         known = self._known(garments, single, first_vertices, None)
         first = self._positions([b.vertices[0] for b in checked])
-        return self._begin(garments, single, packed, known, [first], face_splits)[0]
+        known_materials = as_materials(materials, len(garments), self.network, self.device)
+        blown = self._blown(wind, len(garments))
+        return self._begin(
+            garments, single, packed, known, [first], face_splits, known_materials, [(blown, blown)]
+        )[0]
 
     def step(
-        self, state: SimulationState[Vertices, Status], next_body_vertices: Any
+        self, state: SimulationState[Vertices, Status], next_body_vertices: Any, *, wind: Any = None
     ) -> SimulationState[Vertices, Status]:
         """Simulates the next frame.
 
         Args:
             state: A state from `start` or `step`; it is not changed.
             next_body_vertices: Body in the next frame [m], shape [U,3]; a list if `start` was given one. It is copied.
+            wind: Velocity of the air in the next frame [m/s], as in `start`; None leaves it as it is.
 
         Returns:
             The next state. A garment that is not finite stays so, and its vertices are NaN.
@@ -288,7 +324,7 @@ class Simulator:
         if not all(np.isfinite(array).all() for array in arrays):
             raise MeshError(f"body_vertices of frame {state.frame + 1} hold NaN or infinity; skip or repair the frame")
         with evaluating(self.network):
-            return self._advance(state, body)
+            return self._advance(state, body, self._blown(wind, len(state.scene.garments)))
 
     @torch.inference_mode()
     def _begin(
@@ -299,8 +335,16 @@ class Simulator:
         known: torch.Tensor,
         body_frames: list[torch.Tensor],
         face_splits: int,
+        materials: torch.Tensor | None,
+        wind: list[tuple[torch.Tensor | None, torch.Tensor | None]],
     ) -> list[SimulationState[Any, Any]]:
-        """States of the known frames [K,V,3]: one for a cold start, H with a history."""
+        """States of the known frames [K,V,3]: one for a cold start, H with a history.
+
+        Args:
+            garments, single, bodies, known, body_frames, face_splits: As in `rollout`, packed.
+            materials: The result of `as_materials`.
+            wind: Velocity of the air in each known frame and in the frame before it, [B,3] each; or None.
+        """
         scene = Scene(
             garments,
             bodies,
@@ -314,6 +358,7 @@ class Simulator:
             timings=self.timings,
             contact_sources=self.contact_sources,
             correctors=self.correctors,
+            materials=materials,
         )
         history_length = self.network.config.history
         features = scene.features(known[0], body_frames[0], body_frames[0])
@@ -321,27 +366,49 @@ class Simulator:
         graph = GraphedFrames(scene) if self.graph else None
         finite = torch.ones(len(garments), dtype=torch.bool, device=self.device)
         unsolved = torch.zeros((2, 3), dtype=torch.float64, device=self.device)
+        reads = self.network.reads
+        still = torch.zeros((2 if "wind" in reads else 0, len(garments), 3), device=self.device)
         states: list[SimulationState[Any, Any]] = []
-        for frame, (vertices, body) in enumerate(zip(known, body_frames, strict=True)):
+        for frame, (vertices, body, air) in enumerate(zip(known, body_frames, wind, strict=True)):
+            blowing = still if air[0] is None or air[1] is None or not len(still) else torch.stack([air[0], air[1]])
             if frame:
                 features = scene.features(known[frame - 1], body_frames[frame - 1], body)
                 velocity = scene.centroids(vertices) - scene.centroids(known[frame - 1])
                 history = history.followed(history.stacked(features), velocity)
             depth = scene.contact.depth(vertices, body)
-            now = Frame(vertices, body, history.features, history.velocities, finite, depth, unsolved)
+            past = [max(frame - k, 0) for k in (1, 2)] if "previous" in reads else []
+            now = Frame(
+                vertices,
+                body,
+                history.features,
+                history.velocities,
+                finite,
+                depth,
+                unsolved,
+                previous=torch.stack([known[k] for k in past]) if past else vertices.new_empty((0, *vertices.shape)),
+                previous_body=torch.stack([body_frames[k] for k in past]) if past else body.new_empty((0, *body.shape)),
+                wind=blowing,
+            )
             states.append(SimulationState(scene, single, frame, now, graph))
         return states
 
     @torch.inference_mode()
     def _advance(
-        self, state: SimulationState[Vertices, Status], next_body: torch.Tensor
+        self, state: SimulationState[Vertices, Status], next_body: torch.Tensor, wind: torch.Tensor | None
     ) -> SimulationState[Vertices, Status]:
-        scene = state.scene
+        scene, now = state.scene, state.now.blown(wind)
         if state.graph is None or self.timings.synchronise:
-            after = advance(scene, state.now, next_body)
+            after = advance(scene, now, next_body)
         else:
-            after = state.graph(state.now, next_body)
+            after = state.graph(now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
+
+    def _blown(self, wind: Any, count: int) -> torch.Tensor | None:
+        """The wind of one frame, [B,3], from one that a user gives."""
+        blown = as_wind(wind, count, self.network)
+        if blown is not None and len(blown) != 1:
+            raise ValueError(f"wind of one frame must have shape [3] or [1,{count},3], got {len(blown)} frames")
+        return None if blown is None else self._positions(list(blown))
 
     def _known(self, garments: list[Garment], single: bool, first: Any, history: Any) -> torch.Tensor:
         frames = known_frames(garments, single, first, history, self.network.config.history)
