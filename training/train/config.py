@@ -14,6 +14,7 @@ from warpgarment.training.samples.noise import NoiseConfig
 from warpgarment.training.samples.pushforward import PushforwardConfig
 
 from .losses import LossConfig
+from .position_objective import PositionConfig
 from .unrolled_objective import UnrollConfig
 
 
@@ -85,6 +86,7 @@ class TrainConfig:
     pushforward: PushforwardConfig = field(default_factory=PushforwardConfig)
     unroll: UnrollConfig = field(default_factory=UnrollConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+    outfit: PositionConfig = field(default_factory=PositionConfig)
     validate_every: int = 500
     validate_frames: int = 60
     validate_sequences: int = 3
@@ -108,6 +110,8 @@ class TrainConfig:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
 
+        if self.compile and architecture(self.network_config().architecture).positions:
+            raise ValueError("networks that predict positions are not compiled: leave out compile")
         if self.unroll.steps > 1 and self.compile:
             raise ValueError("unrolled training is not compiled: leave out compile, or set unroll.steps to 1")
         if self.unroll.steps > 1 and self.augmentation.scale:

@@ -27,8 +27,10 @@ from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.leftovers import remove_leftovers
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import architecture, build_network
+from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.distributed import Group, GroupError
 from warpgarment.training.samples.loader import Plan
+from warpgarment.training.samples.outfits import OutfitBuilder
 from warpgarment.training.samples.single_step import SampleBuilder
 
 from .config import TrainConfig
@@ -75,7 +77,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     try:
         sequences = load_sequences(config, network.config, skipped, group)
         validation = load_validation(config, skipped) if group.first else []
-        builder = SampleBuilder(sequences, network.config, config.noise, config.augmentation)
+        builder = make_builder(config, network, sequences)
         sizes, counts = [len(s.faces) for s in sequences], [s.count - config.unroll.steps + 1 for s in sequences]
         plan = Plan(sizes, counts, config.batch_size, config.seed)
         run = Run(config, network, plan, builder, validation, began, group)
@@ -101,6 +103,17 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     if group.first:
         say(f"step {run.step:,}: {best}" + (f", {spelt(run.figures)}" if run.figures else ""))
     return best
+
+
+def make_builder(config: TrainConfig, network: GarmentNetwork, sequences: list) -> SampleBuilder | OutfitBuilder:
+    """The builder of single-step samples, or of outfits for a network that predicts positions."""
+    if architecture(network.config.architecture).positions:
+        less = config.outfit.noise
+        noise = dataclasses.replace(
+            config.noise, position=less * config.noise.position, offset=less * config.noise.offset
+        )
+        return OutfitBuilder(sequences, network, noise, config.outfit.rollout, config.unroll.steps)
+    return SampleBuilder(sequences, network.config, config.noise, config.augmentation)
 
 
 def _prepare(config: TrainConfig) -> None:

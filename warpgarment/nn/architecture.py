@@ -95,6 +95,10 @@ class Architecture(Protocol):
         """
         ...
 
+    def patch_means(self, layout: Any, positions: torch.Tensor) -> torch.Tensor:
+        """The means that `VertexStep.patches` predicts, of positions [V,3]; only for kinds that predict them."""
+        raise NotImplementedError
+
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: Any) -> tuple[int, int]:
         """Number of operations of the forward pass for one row, see flops.py.
 

@@ -36,6 +36,7 @@ class VertexStep(NamedTuple):
     """Output of a network that predicts positions of vertices; `parametrisation.Step` is the output per face."""
 
     positions: torch.Tensor  # [V,3] the next frame before contact [m]; no Poisson system is solved
+    patches: torch.Tensor | None = None  # [P,3] means over patches of the cloth, which only training uses [m]
 
 
 class RowInputs(NamedTuple):

@@ -148,6 +148,19 @@ class GarmentNetwork(nn.Module):
         newest = context(features, layout.face_component, components)
         return compose(output, newest, residual=self.config.residual)
 
+    def observed(self, inputs: FrameInputs, layout: Any, after: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Numbers of which `statistics` holds the mean and deviation, for a network that predicts positions.
+
+        Args:
+            inputs: The batch at frame t.
+            layout: The result of `layout`.
+            after: Positions at t+1 [m], shape [V,3].
+
+        Returns:
+            Rows [*,K] by name, without "_mean" and "_std"; none, as here, if the network has no such statistics.
+        """
+        return {}
+
     def encode(self, face_features: torch.Tensor) -> torch.Tensor:
         """Normalises features in the network's frame; the same statistics serve all frames of the history."""
         x = (self.read(face_features).unflatten(-1, (-1, self.channels.width)) - self.feature_mean) / self.feature_std

@@ -26,7 +26,7 @@ from warpgarment.objects.garment import Garment
 
 from .cloth import ClothPatches, cloth_patches
 from .config import BODY, VERTEX_PATCHES, LayersNetConfig
-from .network import LayersNet
+from .network import LayersLayout, LayersNet
 
 DECODED = 1.2  # patches against which a vertex is decoded on average
 MESH = 10  # mesh edges of a patch
@@ -49,6 +49,10 @@ class Layers(Architecture):
     def geometry(self, garment: Garment, config: NetworkConfig) -> ClothPatches:
         """The garment's patches."""
         return cloth_patches(garment, config.patch_spacing)
+
+    def patch_means(self, layout: LayersLayout, positions: torch.Tensor) -> torch.Tensor:
+        """Means over the vertices of each patch, [V,3] -> [P,3]."""
+        return layout.cloth.means(positions)
 
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
         """Bytes of the patches and of a call, in which the edges of a block or the decoder are largest."""

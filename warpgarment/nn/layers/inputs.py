@@ -124,10 +124,21 @@ def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool
 
 def positions(seen: Seen, acceleration: torch.Tensor) -> torch.Tensor:
     """Positions at t+1 in world space [m], [V,3], from accelerations in the frame of the outfit [m/frame^2], [V,3]."""
-    state = seen.vertices
-    moved = state[:, :3] + (state[:, 3:6] + acceleration)
-    back = seen.heading[seen.outfit_of_vertex].mT
-    return _turned(moved, back) + seen.next_root[seen.outfit_of_vertex]
+    of_vertex = seen.outfit_of_vertex
+    return moved(seen.vertices, acceleration, seen.heading[of_vertex], seen.next_root[of_vertex])
+
+
+def moved(
+    state: torch.Tensor, acceleration: torch.Tensor, heading: torch.Tensor, next_root: torch.Tensor
+) -> torch.Tensor:
+    """The formula above for any points.
+
+    Args:
+        state: States at t, shape [N,12].
+        acceleration: Accelerations in the frame of the outfit [m/frame^2], shape [N,3].
+        heading, next_root: G and r(t+1) [m] of each point, shapes [N,3,3] and [N,3].
+    """
+    return _turned(state[:, :3] + (state[:, 3:6] + acceleration), heading.mT) + next_root
 
 
 def acceleration(seen: Seen, after: torch.Tensor) -> torch.Tensor:

@@ -31,7 +31,7 @@ from warpgarment.objects.pack import PackedGarments
 from .block import Block, Edges, Tokens
 from .cloth import ClothLayout, cloth_layout, cloth_patches
 from .config import BODY, VERTEX_PATCHES, LayersNetConfig
-from .inputs import ATTRIBUTES, Seen, positions, seen
+from .inputs import ATTRIBUTES, Seen, acceleration, moved, positions, seen
 from .turns import Bases, frames, turned
 
 STATE, GRAVITY, WIND = 12, 6, 22
@@ -101,8 +101,11 @@ class LayersNet(GarmentNetwork):
 
     def predict(self, inputs: FrameInputs, layout: LayersLayout, *, bfloat16: bool = False) -> VertexStep:
         """Positions at t+1; see `GarmentNetwork.predict`. The features are not read."""
-        decoded = self.decoded(inputs, layout, bfloat16=bfloat16)
-        return VertexStep(positions(decoded.seen, decoded.vertices))
+        decoded, cloth = self.decoded(inputs, layout, bfloat16=bfloat16), layout.cloth
+        view = decoded.seen
+        outfit = view.outfit_of_garment[cloth.garment_of_patch]
+        patches = moved(cloth.means(view.vertices), decoded.patches, view.heading[outfit], view.next_root[outfit])
+        return VertexStep(positions(view, decoded.vertices), patches)
 
     def decoded(self, inputs: FrameInputs, layout: LayersLayout, *, bfloat16: bool = False) -> Decoded:
         """Accelerations of vertices and of patches; the arguments are those of `predict`."""
@@ -132,6 +135,11 @@ class LayersNet(GarmentNetwork):
             body_token = encoded[0][cloth.patches :]
         with torch.autocast(kind, enabled=False):
             return self._decode(view, cloth, state, patch, received.to(state.dtype), body_token.to(state.dtype), nearest)
+
+    def observed(self, inputs: FrameInputs, layout: LayersLayout, after: torch.Tensor) -> dict[str, torch.Tensor]:
+        """States of garments and bodies together, and accelerations; see `GarmentNetwork.observed`."""
+        view = seen(inputs, layout.cloth, fps=self.config.fps, canonical=self.config.heading == "canonical")
+        return {"state": torch.cat([view.vertices, view.body]), "acceleration": acceleration(view, after)}
 
     def _edges(
         self, view: Seen, patch_state: torch.Tensor, layout: LayersLayout
