@@ -23,20 +23,30 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from .config import BODY, LayersNetConfig
+from .config import LayersNetConfig
 from .turns import Bases, turned
 
 TURNED = ("body", "wind", "gravity")  # senders with a direction, each with layers of its own
 SHORTEST = 1e-6  # added to |r - s|^2
 
 
-class Edges(NamedTuple):
-    """Which tokens each of P patches sees. Tokens are numbered with the patches first; -1 where there is none."""
+class Links(NamedTuple):
+    """Pairs of a patch that sees and a token that is seen, E of them, out of a table of P x K."""
 
-    plain: torch.Tensor  # int64 [P,K], patches that world edges join
-    directed: torch.Tensor  # int64 [P,BODY+2], body vertices, then wind and gravity
-    rotation: torch.Tensor  # [P,BODY+2,3,3], R of these senders
-    mesh: torch.Tensor  # int64 [P,M], mesh patches, then the token of the garment's attributes
+    patch: torch.Tensor  # int64 [E]
+    token: torch.Tensor  # int64 [E]; tokens are numbered with the patches first
+    place: torch.Tensor  # int64 [E], patch * K + column
+    real: torch.Tensor | None  # bool [E], whether there is such a token; None if all are
+    columns: int  # K
+
+
+class Edges(NamedTuple):
+    """What the patches see."""
+
+    world: Links  # patches that world edges join, then body vertices, wind, gravity
+    counts: tuple[int, int, int, int]  # number of links of each of these
+    rotation: torch.Tensor  # [E',3,3], R of those after the patches
+    mesh: Links  # mesh patches and the tokens of attributes
 
 
 class Tokens(NamedTuple):
@@ -74,64 +84,67 @@ class Block(nn.Module):
         receiver = self.receive(value[:patches]) + self.remember(tokens.receiver) + tokens.receiver
         sender = self.send(value) + self.remember(tokens.sender) + tokens.sender
 
-        q, r, s = (part.unflatten(-1, (self.heads, self.head)) for part in (query, receiver, sender))
-        world, mesh = slice(None, self.world), slice(self.world, None)
-        seen = torch.cat(
-            [
-                self._world(q[:, world], r[:, world], s[:, world], edges),
-                self._mesh(q[:, mesh], r[:, mesh], s[:, mesh], edges.mesh),
-            ],
-            dim=1,
-        ).flatten(1)
+        wide = self.world * self.head
+        parts = [(part[:, :wide], part[:, wide:]) for part in (query, receiver, sender)]
+        world, mesh = zip(*parts, strict=True)
+        seen = torch.cat([self._seen(*world, edges.world, edges), self._seen(*mesh, edges.mesh, None)], dim=1)
         update = self.out(self.gain * seen + self.offset)
         value = self.attention_norm(torch.cat([value[:patches] + update, value[patches:]]))
         value = self.feed_forward_norm(value + self.contract(torch.relu(self.expand(value))))
         return Tokens(value, receiver, sender)
 
-    def _mesh(self, q: torch.Tensor, r: torch.Tensor, s: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
-        """What the mesh heads see, [P,H,w]."""
-        score, near, senders = _scores(q, r, s, seen)
-        return _summed(score.softmax(dim=1) * near, r, senders)
+    def _seen(
+        self, q: torch.Tensor, r: torch.Tensor, s: torch.Tensor, links: Links, directed: Edges | None
+    ) -> torch.Tensor:
+        """What some heads see.
 
-    def _world(self, q: torch.Tensor, r: torch.Tensor, s: torch.Tensor, edges: Edges) -> torch.Tensor:
-        """What the world heads see, [P,H,w]."""
-        score, near, senders = _scores(q, r, s, torch.cat([edges.plain, edges.directed], dim=1))
-        share, plain = score.softmax(dim=1), edges.plain.shape[1]
-        values = (r[:, None] + senders[:, plain:]) * near[:, plain:, :, None]
-        values = self.turned_values(values, edges.rotation)
-        directed = (share[:, plain:, :, None] * values).sum(dim=1)
-        return _summed(share[:, :plain] * near[:, :plain], r, senders[:, :plain]) + directed
+        Args:
+            q, r: Queries and receivers of patches, shape [P,H*w].
+            s: Senders, shape [T,H*w].
+            links: Who sees whom.
+            directed: The edges whose last links have a rotation; None if none has.
 
-    def turned_values(self, values: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+        Returns:
+            Sums over the senders, shape [P,H*w].
+        """
+        patches, head = len(q), self.head
+        receiver, sender = r.index_select(0, links.patch), s.index_select(0, links.token)
+        near = ((receiver - sender).square().unflatten(1, (-1, head)).sum(-1) + SHORTEST).rsqrt()  # [E,H]
+        both = receiver + sender
+        score = (q.index_select(0, links.patch) * both).unflatten(1, (-1, head)).sum(-1) * near * (2.0 / head**0.5)
+        if links.real is not None:
+            score = score.masked_fill(~links.real[:, None], -torch.inf)
+        table = score.new_full((patches * links.columns, score.shape[1]), -torch.inf)
+        table = table.index_copy(0, links.place, score).view(patches, links.columns, -1).softmax(dim=1)
+        share = table.flatten(0, 1).index_select(0, links.place)
+        if directed is None:
+            seen = both * (share * near).repeat_interleave(head, dim=1)
+        else:
+            plain = directed.counts[0]
+            weight = torch.cat([share[:plain] * near[:plain], share[plain:]]).repeat_interleave(head, dim=1)
+            values = both[plain:] * near[plain:].repeat_interleave(head, dim=1)
+            turned_ones = self.turned_values(values, directed.rotation, directed.counts[1:])
+            seen = torch.cat([both[:plain], turned_ones.to(both.dtype)]) * weight
+        return torch.zeros_like(q, dtype=seen.dtype).index_add(0, links.patch, seen)
+
+    def turned_values(
+        self, values: torch.Tensor, rotation: torch.Tensor, counts: tuple[int, ...]
+    ) -> torch.Tensor:
         """R_h^T relu(L (R_h f)) of the senders with a direction.
 
         Args:
-            values: f of body vertices, wind and gravity, shape [P,BODY+2,H,w].
-            rotation: Their rotations R, shape [P,BODY+2,3,3].
+            values: f of body vertices, wind and gravity, one after the other, shape [E',H*w].
+            rotation: Their rotations R, shape [E',3,3].
+            counts: Number of each of the three kinds.
         """
         bases = self.bases().unflatten(0, (len(TURNED), self.world))  # [3,H,w,k]
-        parts = values.split([BODY, 1, 1], dim=1), rotation[:, :, None].split([BODY, 1, 1], dim=1)
+        triples = self.world * self.bases.triples
         found = []
-        for kind, (f, turn) in enumerate(zip(*parts, strict=True)):
-            basis = bases[kind]
-            inner = turned(torch.einsum("pkhw,hwi->pkhi", f, basis), turn)
-            layer = self.turned_weight[kind] @ basis  # the basis and the layer are one product
-            hidden = torch.relu(torch.einsum("pkhi,hwi->pkhw", inner, layer) + self.turned_bias[kind])
-            back = turned(torch.einsum("pkhw,hwi->pkhi", hidden, basis), turn, inverse=True)
-            found.append(torch.einsum("pkhi,hwi->pkhw", back, basis))
-        return torch.cat(found, dim=1)
-
-
-def _scores(
-    q: torch.Tensor, r: torch.Tensor, s: torch.Tensor, seen: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Scores [P,K,H] (-inf where nothing is seen), 1 / |r - s| [P,K,H], and senders [P,K,H,w]."""
-    senders = s[seen.clamp(min=0)]
-    near = ((r[:, None] - senders).square().sum(-1) + SHORTEST).rsqrt()
-    score = (q[:, None] * (r[:, None] + senders)).sum(-1) * near * (2.0 / q.shape[-1] ** 0.5)
-    return score.masked_fill((seen < 0)[..., None], -torch.inf), near, senders
-
-
-def _summed(weight: torch.Tensor, r: torch.Tensor, senders: torch.Tensor) -> torch.Tensor:
-    """sum_k weight_k (r + s_k): [P,K,H], [P,H,w] and [P,K,H,w] -> [P,H,w]."""
-    return r * weight.sum(dim=1)[..., None] + torch.einsum("pkh,pkhw->phw", weight, senders)
+        for kind, (f, turn) in enumerate(zip(values.split(counts), rotation.split(counts), strict=True)):
+            basis = self.bases.matrix(bases[kind])
+            layer = torch.block_diag(*self.turned_weight[kind]) @ basis  # the basis and the layer are one product
+            inner = turned(f @ basis.to(f.dtype), turn, triples)
+            hidden = torch.relu(inner @ layer.mT.to(f.dtype) + self.turned_bias[kind].flatten())
+            back = turned(hidden @ basis.to(hidden.dtype), turn, triples, inverse=True)
+            found.append(back @ basis.mT.to(back.dtype))
+        return torch.cat(found)

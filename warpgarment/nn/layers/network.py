@@ -28,7 +28,7 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
-from .block import Block, Edges, Tokens
+from .block import Block, Edges, Links, Tokens
 from .cloth import ClothLayout, cloth_layout, cloth_patches
 from .config import BODY, VERTEX_PATCHES, LayersNetConfig
 from .inputs import ATTRIBUTES, Seen, acceleration, moved, positions, seen
@@ -165,19 +165,18 @@ class LayersNet(GarmentNetwork):
         mine = cloth.garment_of_patch
         known = torch.isfinite(view.attributes).all(dim=1)[mine]
         mesh = torch.cat([cloth.mesh.long(), torch.where(known, attributes + mine, -1)[:, None]], dim=1)
-        directed = torch.cat(
-            [torch.where(near < 0, -1, near + patches), (wind + mine)[:, None], (gravity + outfit)[:, None]], dim=1
-        )
+        tables = [plain, torch.where(near < 0, -1, near + patches), (wind + mine)[:, None], (gravity + outfit)[:, None]]
+        world, counts = _links(tables)
         turn = frames(view.normals[used])
+        beside = (world.token[counts[0] : counts[0] + counts[1]] - patches).clamp(min=0)
         around = torch.cat(
             [
-                turn[near.clamp(min=0)] if len(used) else turn.new_zeros((patches, BODY, 3, 3)),
-                frames(view.air)[mine][:, None],
-                frames(view.gravity[:, 0], -1.0)[outfit][:, None],
-            ],
-            dim=1,
+                turn.index_select(0, beside),
+                frames(view.air).index_select(0, mine),
+                frames(view.gravity[:, 0], -1.0).index_select(0, outfit),
+            ]
         )
-        return _NearestBody(of_vertex, near[:, 0], turn), Edges(plain, directed, around, mesh), used
+        return _NearestBody(of_vertex, near[:, 0], turn), Edges(world, counts, around, _links([mesh])[0]), used
 
     def _decode(
         self,
@@ -190,33 +189,31 @@ class LayersNet(GarmentNetwork):
         nearest: _NearestBody,
     ) -> Decoded:
         """Accelerations from the state after the blocks; `received` [P,D] and `body_token` [U',D] are tokens."""
-        bases, heads = self.bases(), self.config.heads
-
-        def inner(tokens: torch.Tensor) -> torch.Tensor:
-            return torch.einsum("nhw,hwi->nhi", tokens.unflatten(-1, (heads, -1)), bases)
-
-        of_patch, of_body = inner(received), inner(body_token)
+        basis = self.bases.matrix(self.bases())
+        triples = self.config.heads * self.bases.triples
+        of_patch, of_body = received @ basis, body_token @ basis
         chosen = self._patches_of_vertices(state, patch, cloth)
         vertex, slot = _real(chosen)
-        relative = torch.cat([state[vertex] - patch[chosen[vertex, slot].clamp(min=0)], torch.zeros_like(patch)])
-        which = torch.cat([chosen[vertex, slot].clamp(min=0), torch.arange(len(patch), device=patch.device)])
+        which = chosen[vertex, slot].clamp(min=0)
+        relative = torch.cat([state[vertex] - patch[which], torch.zeros_like(patch)])
+        which = torch.cat([which, torch.arange(len(patch), device=patch.device)])
         point = torch.cat([nearest.of_vertex[vertex], nearest.of_patch])
 
-        there = point >= 0
+        there, point = (point >= 0)[:, None], point.clamp(min=0)
         eye = torch.eye(3, dtype=state.dtype, device=state.device)
         if len(body_token):
-            turn = torch.where(there[:, None, None], nearest.rotation[point.clamp(min=0)], eye)
-            beneath = torch.where(there[:, None, None], of_body[point.clamp(min=0)], 0.0)
+            turn = torch.where(there[..., None], nearest.rotation.index_select(0, point), eye)
+            beneath = torch.where(there, of_body.index_select(0, point), 0.0)
         else:
-            turn, beneath = eye.expand(len(point), 3, 3), torch.zeros_like(of_patch[which])
+            turn, beneath = eye.expand(len(point), 3, 3), of_patch.new_zeros((len(point), of_patch.shape[1]))
         # the basis and the first layer are one product: W (Q R Q^T e) = (W Q) (R Q^T e)
         first = cast(nn.Linear, self.decoder[0])
         own, patches, bodies = first.weight.split([STATE, *2 * [received.shape[1]]], dim=1)
-        hidden = torch.nn.functional.linear(turned(relative, turn), own, first.bias)
-        for part, weight in ((of_patch[which], patches), (beneath, bodies)):
-            folded = torch.einsum("mhw,hwi->mhi", weight.unflatten(-1, (heads, -1)), bases).flatten(1)
-            hidden = hidden + turned(part, turn[:, None]).flatten(1) @ folded.mT
-        answer = turned(self.decoder[1:](hidden), turn, inverse=True)
+        relative = turned(_by_axis(relative), turn, STATE // 3)
+        hidden = torch.nn.functional.linear(relative, _by_axis(own), first.bias)
+        for part, weight in ((of_patch.index_select(0, which), patches), (beneath, bodies)):
+            hidden = hidden + turned(part, turn, triples) @ (weight @ basis).mT
+        answer = turned(self.decoder[1:](hidden), turn, 1, inverse=True)
         answer = answer * self.acceleration_std + self.acceleration_mean
 
         weight = (chosen >= 0).to(state.dtype)
@@ -257,6 +254,31 @@ class _NearestBody(NamedTuple):
 def _start(width: int) -> nn.Sequential:
     """The layers that make receivers, or senders, of encoded tokens."""
     return nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.LayerNorm(width))
+
+
+def _by_axis(states: torch.Tensor) -> torch.Tensor:
+    """States [N,12], four vectors one after the other, sorted by x, y and z as `turned` expects it."""
+    return states.unflatten(1, (-1, 3)).mT.flatten(1)
+
+
+def _links(tables: list[torch.Tensor]) -> tuple[Links, tuple[int, ...]]:
+    """Links of the entries of tables [P,K] of tokens, table by table, and how many each has; -1 is no token.
+
+    On a GPU, which would have to wait for the number of real entries, all are links.
+    """
+    columns, start = sum(table.shape[1] for table in tables), 0
+    rows, tokens, places, real = [], [], [], []
+    for table in tables:
+        row, column = _real(table)
+        token = table[row, column]
+        rows.append(row)
+        tokens.append(token.clamp(min=0))
+        places.append(row * columns + column + start)
+        real.append(token >= 0)
+        start += table.shape[1]
+    there = None if tables[0].device.type == "cpu" else torch.cat(real)
+    links = Links(torch.cat(rows), torch.cat(tokens), torch.cat(places), there, columns)
+    return links, tuple(len(row) for row in rows)
 
 
 def _used(

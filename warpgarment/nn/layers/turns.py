@@ -60,19 +60,21 @@ def quaternions(directions: torch.Tensor) -> torch.Tensor:
     return torch.where((d == 0.0).all(-1, keepdim=True), rest, found)
 
 
-def turned(inner: torch.Tensor, rotation: torch.Tensor, *, inverse: bool = False) -> torch.Tensor:
-    """R (+) R (+) ... (+) 1 applied to vectors.
+def turned(inner: torch.Tensor, rotation: torch.Tensor, triples: int, *, inverse: bool = False) -> torch.Tensor:
+    """R applied to some triples of numbers in each row, which lie as in `Bases.matrix`: all x, all y, all z, the rest.
 
     Args:
-        inner: Vectors [...,K]; as many triples as fit are turned, the rest stays.
-        rotation: Rotations R, with which the leading axes are broadcast, shape [...,3,3].
+        inner: Rows [N,K].
+        rotation: Rotations R, shape [N,3,3].
+        triples: Number of triples; further numbers of a row stay.
         inverse: Whether to turn back.
     """
-    whole = inner.shape[-1] // 3 * 3
-    rotation = rotation if inverse else rotation.mT
-    triples = inner[..., :whole].unflatten(-1, (-1, 3)) @ rotation
-    triples = triples.flatten(-2)
-    return triples if whole == inner.shape[-1] else torch.cat([triples, inner[..., whole:]], dim=-1)
+    part = inner[:, : 3 * triples].unflatten(1, (3, triples))
+    rotation = rotation.mT if inverse else rotation
+    x, y, z = part.unbind(1)
+    r = rotation[..., None]  # much faster than products of matrices of 3 x 3
+    rows = [x * r[:, j, 0] + y * r[:, j, 1] + z * r[:, j, 2] for j in range(3)]
+    return torch.cat([*rows, inner[:, 3 * triples :]], dim=1)
 
 
 class Bases(nn.Module):
@@ -87,6 +89,8 @@ class Bases(nn.Module):
     def __init__(self, count: int, width: int, kind: str) -> None:
         super().__init__()
         self.orthogonal = kind == "orthogonal"
+        inner = width if self.orthogonal else 3
+        self.triples = inner // 3  # of a head
         shape = (count, width, width) if self.orthogonal else (count, width, 3)
         self.weight = nn.Parameter(torch.randn(shape) / width**0.5)
 
@@ -100,6 +104,22 @@ class Bases(nn.Module):
         for axis in axes.unbind(1):  # Q (I - 2 u u^T)
             basis = basis - 2.0 * (basis @ axis[..., None]) @ axis[:, None, :]
         return basis
+
+    def matrix(self, bases: torch.Tensor) -> torch.Tensor:
+        """The bases of some heads as one matrix [H*w,K], by which rows of all heads are multiplied.
+
+        Its columns are sorted as `turned` expects it, by x, y and z of all triples of all heads, and then the rest.
+
+        Args:
+            bases: Some rows of the result of `forward`, shape [H,w,k].
+        """
+        heads, width, inner = bases.shape
+        eye = torch.eye(heads, dtype=bases.dtype, device=bases.device)
+        blocks = bases[:, :, None, :] * eye[:, None, :, None]  # [H,w,H,k]
+        whole = 3 * self.triples
+        turning = blocks[..., :whole].unflatten(-1, (self.triples, 3)).permute(0, 1, 4, 2, 3)
+        parts = [turning.reshape(heads * width, -1), blocks[..., whole:].reshape(heads * width, -1)]
+        return torch.cat(parts, dim=1)
 
     def penalty(self) -> torch.Tensor:
         """Mean square of W W^T - I, a scalar, which the publication adds to its loss and no W can make zero."""
