@@ -214,7 +214,7 @@ class Twin:
                         scores.append(2 * query[p, at] @ f / np.sqrt(width))
                         if kind in order:
                             k = order.index(kind)
-                            turned = self.hidden(f"{name}.bases", k * c.world_heads + head, frames[kind][number])
+                            turned = self.hidden(f"{name}.bases", head, frames[kind][number])
                             layer = self.w[f"{name}.turned_weight"][k, head]
                             f = turned.T @ np.maximum(layer @ turned @ f + self.w[f"{name}.turned_bias"][k, head], 0)
                         values.append(f)

@@ -22,7 +22,7 @@ from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
 
 from . import hub, shards
-from .architecture import ARCHITECTURES, architecture, build_network
+from .architecture import ARCHITECTURES, architecture, build_network, check_name
 from .bounds import check_settings, checked_json
 from .config import NetworkConfig
 from .device import device_of
@@ -228,6 +228,11 @@ def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[st
 
 def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
     name = settings.get("architecture")
+    if isinstance(name, str):
+        try:
+            check_name(name)
+        except ValueError as error:
+            raise CheckpointError(f"{path}: {error}") from None
     described = architecture(name).config if isinstance(name, str) and name in ARCHITECTURES else NetworkConfig
     fields = {field.name: field for field in dataclasses.fields(described)}
     unknown = sorted(settings.keys() - fields.keys())

@@ -28,8 +28,10 @@ from .cloth import ClothPatches, cloth_patches
 from .config import BODY, VERTEX_PATCHES, LayersNetConfig
 from .network import LayersLayout, LayersNet
 
-DECODED = 1.2  # patches against which a vertex is decoded on average
-MESH = 10  # mesh edges of a patch
+DECODED = 1.1  # patches against which a vertex is decoded on average
+MESH, PADDED_MESH = 12, 18  # mesh edges of a patch, and with padding
+WORLD = 11  # world edges and body vertices that a patch sees
+BODIES = 6  # body vertices that are seen, for each patch
 PER_VERTEX = 200  # bytes of memberships and of the heading
 
 
@@ -59,14 +61,16 @@ class Layers(Architecture):
         assert isinstance(config, LayersNetConfig)
         patches = sum(self.geometry(garment, config).count for garment in sizes.garments)
         vertices = sum(len(garment.vertices) for garment in sizes.garments)
-        width, world = config.embedding, config.world_heads * config.head_width
-        bodies = min(sizes.body_vertices, 8 * patches) if sizes.cpu else sizes.body_vertices
+        width, half = config.embedding, config.embedding // 2  # about half of the heads see the world
+        if sizes.cpu:  # only what there is
+            bodies, mesh, world, pairs = min(sizes.body_vertices, int(BODIES * patches)), MESH, WORLD, DECODED
+        else:
+            bodies, mesh, world, pairs = sizes.body_vertices, PADDED_MESH, config.patch_neighbours + BODY, VERTEX_PATCHES
         tokens = patches + bodies + 2 * len(sizes.garments)
-        edges = patches * (BODY + 2) * (5 * world + 20) + patches * config.patch_neighbours * 2 * world
-        pairs = int((DECODED if sizes.cpu else VERTEX_PATCHES) * vertices) + patches
-        decoder = pairs * (4 * width + 2 * config.decoder)
-        inside = tokens * (5 * width + config.feed_forward) + max(edges, decoder)
-        return {"patches": PER_VERTEX * vertices + 4 * MESH * patches, "network": 4 * inside}
+        edges = patches * half * max(8 * (world + 2), 6 * mesh)
+        block = 6 * tokens * width + max(edges, 2 * tokens * config.feed_forward)
+        decoder = int(pairs * vertices + patches) * 7 * max(width, config.decoder)
+        return {"patches": PER_VERTEX * vertices + 4 * mesh * patches, "network": 4 * max(block, decoder)}
 
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: Any) -> tuple[int, int]:
         """Operations for one outfit.

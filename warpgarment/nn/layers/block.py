@@ -69,7 +69,7 @@ class Block(nn.Module):
         width, head, heads = config.embedding, config.head_width, config.world_heads
         self.heads, self.world, self.head = config.heads, heads, head
         self.query, self.receive, self.send, self.remember = (nn.Linear(width, width, bias=False) for _ in range(4))
-        self.bases = Bases(len(TURNED) * heads, head, config.rotation)
+        self.bases = Bases(heads, head, config.rotation)  # one for each head, so that it turns as one space
         self.turned_weight = nn.Parameter(torch.randn(len(TURNED), heads, head, head) / head**0.5)
         self.turned_bias = nn.Parameter(torch.zeros(len(TURNED), heads, head))
         self.gain, self.offset = nn.Parameter(torch.ones(width)), nn.Parameter(torch.zeros(width))
@@ -137,11 +137,10 @@ class Block(nn.Module):
             rotation: Their rotations R, shape [E',3,3].
             counts: Number of each of the three kinds.
         """
-        bases = self.bases().unflatten(0, (len(TURNED), self.world))  # [3,H,w,k]
+        basis = self.bases.matrix(self.bases())
         triples = self.world * self.bases.triples
         found = []
         for kind, (f, turn) in enumerate(zip(values.split(counts), rotation.split(counts), strict=True)):
-            basis = self.bases.matrix(bases[kind])
             layer = torch.block_diag(*self.turned_weight[kind]) @ basis  # the basis and the layer are one product
             inner = turned(f @ basis.to(f.dtype), turn, triples)
             hidden = torch.relu(inner @ layer.mT.to(f.dtype) + self.turned_bias[kind].flatten())

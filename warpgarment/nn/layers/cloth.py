@@ -1,7 +1,7 @@
 """Patches of a garment as LayersNet has them: clusters of faces, and the vertices that these touch.
 
-The faces are divided by their nearest centre of the project's geodesic patches (`nn/patches/layout.py`), which are some
-6 to 8 cm wide with the default spacing. A vertex belongs to every patch whose faces it touches; its own is the one with
+The faces are divided by their nearest centre of the project's geodesic patches (`nn/patches/layout.py`), which are 7
+to 8 cm wide with a spacing of 5.5 cm, and 11 cm with one of 8 cm. A vertex belongs to every patch whose faces it touches; its own is the one with
 the nearest mean in the rest pose. A patch's state is the mean of its vertices. Mesh edges join patches that share a
 vertex, or two of whose vertices are joined by an edge of the mesh; a patch is joined to itself.
 """

@@ -40,7 +40,7 @@ class LayersNetConfig(NetworkConfig):
     residual: bool = True
     heading: str = "canonical"
     architecture: str = "layers"
-    patch_spacing: float = 0.055
+    patch_spacing: float = 0.08
     world_heads: int = 4
     decoder: int = 128
     rotation: str = "orthogonal"
@@ -78,6 +78,7 @@ class LayersNetConfig(NetworkConfig):
             "heading": "world",
             "decoder": 268,
             "rotation": "published",
+            "patch_spacing": 0.055,
             "patch_radius": 0.04,
             "body_radius": 0.06,
         }

@@ -36,6 +36,7 @@ from .turns import Bases, frames, turned
 
 STATE, GRAVITY, WIND = 12, 6, 22
 KINDS = ("state", "attributes", "wind", "gravity")  # of tokens, in their order: patches and body vertices are "state"
+WAITS = ("cpu",)  # devices on which the number of real entries of a table is read; a GPU would have to be waited for
 STATISTICS = {"state_mean": STATE, "state_std": STATE, "acceleration_mean": 3, "acceleration_std": 3}
 
 
@@ -276,7 +277,7 @@ def _links(tables: list[torch.Tensor]) -> tuple[Links, tuple[int, ...]]:
         places.append(row * columns + column + start)
         real.append(token >= 0)
         start += table.shape[1]
-    there = None if tables[0].device.type == "cpu" else torch.cat(real)
+    there = None if tables[0].device.type in WAITS else torch.cat(real)
     links = Links(torch.cat(rows), torch.cat(tokens), torch.cat(places), there, columns)
     return links, tuple(len(row) for row in rows)
 
@@ -288,7 +289,7 @@ def _used(
 
     On a CPU only these become tokens, a part of the body. A GPU would have to wait for their number, and takes all.
     """
-    if near.device.type != "cpu":
+    if near.device.type not in WAITS:
         return torch.arange(count, device=near.device), near, of_vertex
     used = torch.cat([near.flatten(), of_vertex]).unique()
     used = used[used >= 0]
@@ -299,7 +300,7 @@ def _used(
 
 def _real(chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Rows and columns of the entries that are not -1; on a GPU, which would have to wait for their number, of all."""
-    if chosen.device.type == "cpu":
+    if chosen.device.type in WAITS:
         row, column = (chosen >= 0).nonzero(as_tuple=True)
         return row, column
     rows, columns = chosen.shape
