@@ -187,9 +187,9 @@ def test_memory_is_within_its_forecast(kind, number):
     packed = PackedGarments.pack(garments, CPU)
     features = torch.randn(len(packed.faces), config.history, FACE.width)
     velocities = torch.zeros(packed.component_count, config.history - 1, 3)
-    motion, rest = walk(1), packed.rest_vertices
-    bodies = PackedBodies.pack([motion.faces], [motion.vertices.shape[1]], [0] * number, CPU)
-    body = torch.from_numpy(np.array(motion.vertices[0] * [1.5, 1.0, 1.5], np.float32))  # beneath the garments
+    rest, beneath = packed.rest_vertices, garments[0]
+    bodies = PackedBodies.pack([beneath.faces], [len(beneath.vertices)], [0] * number, CPU)
+    body = torch.from_numpy((beneath.vertices * [0.9, 1.0, 0.9]).astype(np.float32))
     past = {"previous": rest.expand(2, -1, -1), "previous_body": body.expand(2, -1, -1), "bodies": bodies}
 
     @torch.inference_mode()
