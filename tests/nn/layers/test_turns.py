@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from support.outfits import inputs_of, layersnet, layout_of, moving
 
+import warpgarment.nn.layers.network as module
 from warpgarment.nn.layers.block import Block, Edges, Links, Tokens
 from warpgarment.nn.layers.config import BODY, LayersNetConfig
 from warpgarment.nn.layers.turns import Bases, frames, quaternions, turned
@@ -156,8 +157,6 @@ def test_links_with_and_without_padding():
     layout = layout_of(network, garments)
     with torch.no_grad():
         plain = network.predict(inputs, layout).positions
-        import warpgarment.nn.layers.network as module
-
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(module, "WAITS", ())
             padded = network.predict(inputs, layout).positions
