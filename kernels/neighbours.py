@@ -1,7 +1,7 @@
 """The nearest points of another cloud within a radius, each within its own group: edges between patches and bodies.
 
-For every point p of group g, the targets y of the same group with |p - y| <= radius, the nearest `count` of them, nearest
-first; equally near ones in the order of their indices. Groups are the outfits of a batch, which may lie at the same
+For every point p of group g, the nearest `count` of the targets y of its group with |p - y| <= radius, nearest first;
+equally near ones in the order of their indices. Groups are the outfits of a batch, which may lie at the same
 place. A hash grid with cells as wide as the radius finds the candidates, so a search costs what is near a point and not
 what there is. Nothing waits for the device: results have a fixed width, and what is not there is -1.
 
@@ -48,7 +48,7 @@ def nearest_points_kernel(
     if not wp.isfinite(point):
         return
     query = wp.hash_grid_query(grid, point, radius, group[i])
-    target = int(0)
+    target = 0
     while wp.hash_grid_query_next(query, target):
         d = wp.length(targets[target] - point)
         if not d <= radius:

@@ -163,9 +163,7 @@ def test_earlier_frames_materials_and_wind(live):
     simulator = Simulator(network, "cpu", collision_passes=0)
     materials, wind = [None, Material(density=0.3)], np.arange(5 * 2 * 3, dtype=np.float32).reshape(5, 2, 3)
     if live:
-        state = simulator.start(
-            garments, motion.vertices[0], motion.faces, materials=materials, wind=wind[:1]
-        )
+        state = simulator.start(garments, motion.vertices[0], motion.faces, materials=materials, wind=wind[:1])
         frames = [state.vertices]
         for t in range(1, 5):
             state = simulator.step(state, motion.vertices[t], wind=wind[t : t + 1])

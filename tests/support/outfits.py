@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from support.scenes import tube, walk
 
+from support.scenes import tube, walk
 from warpgarment.nn.inputs import FrameInputs
 from warpgarment.nn.layers.config import LayersNetConfig
 from warpgarment.nn.layers.network import LayersNet
@@ -130,4 +130,6 @@ def answer(network: LayersNet, outfits: list[Outfit]) -> list[np.ndarray]:
 
 def turned_motion(motion: BodyMotion, rotation: np.ndarray, shift: np.ndarray) -> BodyMotion:
     """A motion turned and then moved."""
-    return BodyMotion(motion.vertices @ rotation.T.astype(np.float32) + shift.astype(np.float32), motion.faces, motion.fps)
+    return BodyMotion(
+        motion.vertices @ rotation.T.astype(np.float32) + shift.astype(np.float32), motion.faces, motion.fps
+    )

@@ -1,7 +1,7 @@
-"""Samples for networks that predict positions: whole outfits on their bodies, with materials and wind, over some frames.
+"""Samples for networks that predict positions: whole outfits on their bodies, with materials and wind, in some frames.
 
-A sample is a sequence and the newest frame t of a history. The batch holds the recorded frames t-K-2 ... t+G, from which
-a rollout of K steps ends at t and G further steps have a loss; frames before the first one repeat it on a body that
+A sample is a sequence and the newest frame t of a history. The batch holds the recorded frames t-K-2 ... t+G. A rollout
+of K steps ends at t and G further steps have a loss; frames before the first one repeat it on a body that
 stands still, as in a cold start. Each sample has a random number from 0 to 1, by which the objective chooses the step
 from which predictions replace the truth, and a displacement of its history (noise.py).
 """
@@ -74,7 +74,7 @@ class OutfitData:
 
 @dataclass(frozen=True)
 class OutfitBatch:
-    """Outfits in N = K + 3 + G frames, packed; lengths in metres, in world space. A sample is one outfit on one body."""
+    """Outfits in N = K + 3 + G frames, packed; metres, world space. A sample is one outfit on one body."""
 
     packed: PackedGarments
     bodies: PackedBodies

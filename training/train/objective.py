@@ -95,7 +95,9 @@ class Trainer:
         compile: Whether to compile the objective.
     """
 
-    def __init__(self, objective: Objective | UnrolledObjective | PositionObjective, group: Group, compile: bool) -> None:
+    def __init__(
+        self, objective: Objective | UnrolledObjective | PositionObjective, group: Group, compile: bool
+    ) -> None:
         self.compiled, self._worked = compile, False
         self._inputs: Callable[..., tuple] = objective.inputs  # from a batch to arguments of the objective
         if compile:

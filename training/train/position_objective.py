@@ -9,10 +9,10 @@ in the loss are in decimetres, the size of the publication's scenes:
     L = position * mean |x - x*|^2 + patch * mean |x_p - x*_p|^2 + normal * mean |n - n*|^2
         + body * mean_{d < threshold} (threshold - d)^2 + layers * (the same between consecutive garments)
 
-x are vertices, x_p means over patches (of networks that predict them), n unit normals of vertices, d signed distances to
-the surface of the body (or of the garment beneath, along the normal of its nearest face, where that is within `reach`);
-means of collision terms are over the violators. Nearest faces are found without gradient. These two terms begin after
-`collisions_from` of the run.
+x are vertices, x_p means over patches (of networks that predict them), n unit normals of vertices, d signed distances
+to the surface of the body, or of the garment beneath, along the normal of its nearest face where that is within
+`reach`. Means of collision terms are over the violators. Nearest faces are found without gradient. These two terms
+begin after `collisions_from` of the run.
 
 It departs from the publication in this: distances are to surfaces and not to nearest vertices; each garment is kept
 from the next one beneath it, not the outermost from all others together.
@@ -29,6 +29,7 @@ from torch import nn
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn.architecture import architecture
 from warpgarment.nn.inputs import VertexStep
+from warpgarment.nn.layers.network import LayersNet
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.run import evaluating
 from warpgarment.training.samples.outfits import OutfitBatch
@@ -118,6 +119,7 @@ class PositionObjective(nn.Module):
         weights = [getattr(self.config, name[5:]) for name in self.figures[1:6]]
         total = sum((w * term for w, term in zip(weights, terms, strict=False)), terms.new_zeros(()))
         if self.config.rotation:
+            assert isinstance(self.network, LayersNet)  # no other network has such rotations
             total = total + self.config.rotation * self.network.rotation_penalty()
         return torch.cat([total[None], terms])
 

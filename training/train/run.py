@@ -76,7 +76,7 @@ class Run:
         self.out, self.group, self.device = Path(config.out), group, group.device
         self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
         steps, passes, ahead = config.unroll.steps, config.unroll.collision_passes, config.ahead
-        chosen: Builder[Batch | UnrolledBatch | OutfitBatch] = builder
+        chosen: Builder[Any] = builder
         self.positions = isinstance(builder, OutfitBuilder)
         if isinstance(builder, OutfitBuilder):
             ahead = 0  # the search trees of a layout must stay in one thread
@@ -151,7 +151,9 @@ class Run:
             self.pool.step, self.recent = progress["pool_step"], progress.get("recent", [])
         elif config.init is None and group.first:
             steps = range(2**30, 2**30 + config.statistics_batches)  # none of the run's own
-            single = Loader(self.builder, self.loader.plan, Pool(), 0.0, self.splits)  # single steps in any case
+            single: Loader[Any] = Loader(
+                self.builder, self.loader.plan, Pool(), 0.0, self.splits
+            )  # single steps in any case
             batches = (single.build(step, splits=config.splits, part=slice(None)) for step in steps)
             measured = position_statistics if self.positions else statistics
             self.network.set_statistics(measured(batches, self.network))

@@ -97,7 +97,7 @@ class Architecture(Protocol):
 
     def patch_means(self, layout: Any, positions: torch.Tensor) -> torch.Tensor:
         """The means that `VertexStep.patches` predicts, of positions [V,3]; only for kinds that predict them."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} predicts no patches")
 
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: Any) -> tuple[int, int]:
         """Number of operations of the forward pass for one row, see flops.py.

@@ -243,8 +243,8 @@ class GarmentNetwork(nn.Module):
         """Replaces statistics of the normalisation.
 
         Args:
-            statistics: Values by name, any of the attribute `statistics` and of the length given there. They describe inputs in the
-                canonical frame, and targets from `parametrisation.targets` in the canonical frame.
+            statistics: Values by name, any of the attribute `statistics` and of the length given there. They describe
+                inputs in the canonical frame, and targets from `parametrisation.targets` in the canonical frame.
 
         Raises:
             ValueError: An unknown name, a wrong length, a value that is not finite, a deviation that is not positive,

@@ -18,7 +18,9 @@ FASTEST = 100.0  # m/s; faster air than in any storm is a mistake of unit
 Materials = Material | Sequence[Material | None] | None
 
 
-def as_materials(materials: Materials, count: int, network: GarmentNetwork, device: torch.device) -> torch.Tensor | None:
+def as_materials(
+    materials: Materials, count: int, network: GarmentNetwork, device: torch.device
+) -> torch.Tensor | None:
     """Materials as a tensor.
 
     Args:

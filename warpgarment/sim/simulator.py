@@ -30,13 +30,11 @@ from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
 from .arguments import as_array, counted, known_frames, listed, per_garment
-from .frame import Frame
 from .graph import GraphedFrames
-from .history import History
 from .outdoors import Materials, as_materials, as_wind
 from .recording import READ_EVERY, Recording
 from .scene import Scene
-from .state import SimulationState, Status, Vertices
+from .state import SimulationState, Status, Vertices, starting_states
 from .timing import Timings
 
 
@@ -205,7 +203,7 @@ class Simulator:
         def wind_at(frame: int) -> torch.Tensor | None:
             return None if blown is None else self._positions(list(blown[[min(max(frame, 0), len(blown) - 1)]]))
 
-        blowing = [(wind_at(frame), wind_at(frame - 1)) for frame in range(given)]
+        blowing = [wind_at(frame) for frame in range(given)]
         states = self._begin(garments, single, packed, known, first, face_splits, known_materials, blowing)
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
@@ -295,9 +293,7 @@ class Simulator:
         first = self._positions([b.vertices[0] for b in checked])
         known_materials = as_materials(materials, len(garments), self.network, self.device)
         blown = self._blown(wind, len(garments))
-        return self._begin(
-            garments, single, packed, known, [first], face_splits, known_materials, [(blown, blown)]
-        )[0]
+        return self._begin(garments, single, packed, known, [first], face_splits, known_materials, [blown])[0]
 
     def step(
         self, state: SimulationState[Vertices, Status], next_body_vertices: Any, *, wind: Any = None
@@ -336,14 +332,14 @@ class Simulator:
         body_frames: list[torch.Tensor],
         face_splits: int,
         materials: torch.Tensor | None,
-        wind: list[tuple[torch.Tensor | None, torch.Tensor | None]],
+        wind: Sequence[torch.Tensor | None],
     ) -> list[SimulationState[Any, Any]]:
         """States of the known frames [K,V,3]: one for a cold start, H with a history.
 
         Args:
             garments, single, bodies, known, body_frames, face_splits: As in `rollout`, packed.
             materials: The result of `as_materials`.
-            wind: Velocity of the air in each known frame and in the frame before it, [B,3] each; or None.
+            wind: As in `starting_states`.
         """
         scene = Scene(
             garments,
@@ -360,37 +356,7 @@ class Simulator:
             correctors=self.correctors,
             materials=materials,
         )
-        history_length = self.network.config.history
-        features = scene.features(known[0], body_frames[0], body_frames[0])
-        history = History.cold(features, scene.packed.component_count, history_length)
-        graph = GraphedFrames(scene) if self.graph else None
-        finite = torch.ones(len(garments), dtype=torch.bool, device=self.device)
-        unsolved = torch.zeros((2, 3), dtype=torch.float64, device=self.device)
-        reads = self.network.reads
-        still = torch.zeros((2 if "wind" in reads else 0, len(garments), 3), device=self.device)
-        states: list[SimulationState[Any, Any]] = []
-        for frame, (vertices, body, air) in enumerate(zip(known, body_frames, wind, strict=True)):
-            blowing = still if air[0] is None or air[1] is None or not len(still) else torch.stack([air[0], air[1]])
-            if frame:
-                features = scene.features(known[frame - 1], body_frames[frame - 1], body)
-                velocity = scene.centroids(vertices) - scene.centroids(known[frame - 1])
-                history = history.followed(history.stacked(features), velocity)
-            depth = scene.contact.depth(vertices, body)
-            past = [max(frame - k, 0) for k in (1, 2)] if "previous" in reads else []
-            now = Frame(
-                vertices,
-                body,
-                history.features,
-                history.velocities,
-                finite,
-                depth,
-                unsolved,
-                previous=torch.stack([known[k] for k in past]) if past else vertices.new_empty((0, *vertices.shape)),
-                previous_body=torch.stack([body_frames[k] for k in past]) if past else body.new_empty((0, *body.shape)),
-                wind=blowing,
-            )
-            states.append(SimulationState(scene, single, frame, now, graph))
-        return states
+        return starting_states(scene, single, known, body_frames, wind, GraphedFrames(scene) if self.graph else None)
 
     @torch.inference_mode()
     def _advance(

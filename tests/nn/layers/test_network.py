@@ -9,7 +9,7 @@ import pytest
 import torch
 from reference.layersnet import Twin
 from scipy.spatial.transform import Rotation
-from support.outfits import answer, inputs_of, inner, layersnet, layout_of, moving, outer, turned_motion
+from support.outfits import answer, inner, inputs_of, layersnet, layout_of, moving, outer, turned_motion
 from support.scenes import walk
 
 from warpgarment.nn.layers.inputs import acceleration, positions, seen
@@ -36,7 +36,7 @@ def twin(network, outfit):
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_agrees_with_the_dense_twin(name):
-    """A step of the forward pass would be another one than the text says. 1e-9 m of steps of millimetres, in float64."""
+    """A step of the forward pass would be another than the text says. 1e-9 m of steps of millimetres, in float64."""
     network, outfit = layersnet(**SETTINGS[name]).double(), moving()
     garments, inputs = inputs_of([outfit])
     with torch.no_grad():
@@ -67,7 +67,7 @@ def test_without_attributes_or_wind():
 
 
 def test_inputs_have_their_say():
-    """Materials, wind, the other garment or the body would have no influence. More than 1e-6 m each; rounding is 1e-12."""
+    """Materials, wind, the other garment or the body would have no influence. More than 1e-6 m; rounding is 1e-12."""
     network, outfit = layersnet().double(), moving()
     plain = answer(network, [outfit])
     others = {

@@ -1,4 +1,4 @@
-"""Rotations of directions and of hidden vectors against SciPy, and what the value path of a block must not depend on."""
+"""Rotations of directions and hidden vectors against SciPy, and what the value path of a block must not depend on."""
 
 from __future__ import annotations
 
@@ -74,7 +74,9 @@ def test_hidden_rotations(width):
     assert (one @ one.mT - torch.eye(len(one))).abs().max() < 1e-12
     assert (hidden(bases, a @ b) - one @ other).abs().max() < 1e-12
     assert (hidden(bases, torch.eye(3).double()) - torch.eye(len(one))).abs().max() < 1e-12
-    assert (one - torch.block_diag(*(one[k : k + width, k : k + width] for k in range(0, len(one), width)))).abs().max() == 0
+    assert (
+        one - torch.block_diag(*(one[k : k + width, k : k + width] for k in range(0, len(one), width)))
+    ).abs().max() == 0
     assert (one - torch.eye(len(one))).abs().max() > 0.1
     assert bases.penalty() < 1e-24
 
@@ -143,9 +145,7 @@ def test_a_block_in_a_turned_hidden_space(rotation, holds):
     tokens = torch.randn(3, patches + bodies + 2, 64).double()
     receiver, sender = tokens[1, :patches], tokens[2]
     plain = block(Tokens(tokens[0], receiver, sender), edges_of(patches, bodies, around))
-    found = other(
-        Tokens(tokens[0], receiver @ wide.mT, sender @ wide.mT), edges_of(patches, bodies, around @ turn.mT)
-    )
+    found = other(Tokens(tokens[0], receiver @ wide.mT, sender @ wide.mT), edges_of(patches, bodies, around @ turn.mT))
     error = (found.value - plain.value).abs().max()
     assert error < 1e-12 if holds else error > 1e-3
 

@@ -174,7 +174,7 @@ def distances(points: torch.Tensor, body, frame: int) -> np.ndarray:
 
 
 def test_collisions_with_the_body(data):
-    """Cloth in the body would not be pushed out, or cloth outside would. Against libigl's distance, 1e-4 of the loss."""
+    """Cloth in the body would not be pushed out, or cloth outside would. Against libigl, 1e-4 of the loss."""
     batch = batch_of(data, network_of())
     frame = batch.frames[3].clone()
     count = len(frame) // 2

@@ -1,7 +1,7 @@
 """The `Architecture` of LayersNet.
 
 Number of operations, for V vertices, P patches, B' other tokens, T = P + B' tokens of width D, feed-forward width F,
-decoder width G, heads of width w, K world and M mesh edges of a patch; searches, softmax and sums over edges not counted:
+decoder width G, heads of width w, K world and M mesh edges of a patch. Searches and softmax are not counted.
 
     encoders         2 T D^2 + 2 D (12 P + 12 B')      and receivers and senders 4 P D^2 + 4 T D^2
     block            2 D^2 (3 P + T) + 2 D^2 (P + T) + 2 P D^2 + 4 T D F
@@ -28,6 +28,7 @@ from .cloth import ClothPatches, cloth_patches
 from .config import BODY, VERTEX_PATCHES, LayersNetConfig
 from .network import LayersLayout, LayersNet
 
+PRESETS = {"layersnet": LayersNetConfig(), "layersnet-paper": LayersNetConfig.paper()}
 DECODED = 1.1  # patches against which a vertex is decoded on average
 MESH, PADDED_MESH = 12, 18  # mesh edges of a patch, and with padding
 WORLD = 11  # world edges and body vertices that a patch sees
@@ -39,7 +40,7 @@ class Layers(Architecture):
     """Garments of an outfit see each other; there are no rows."""
 
     config = LayersNetConfig
-    presets = {"layersnet": LayersNetConfig(), "layersnet-paper": LayersNetConfig.paper()}
+    presets = PRESETS
     subsets = False
     positions = True
 
@@ -59,13 +60,18 @@ class Layers(Architecture):
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
         """Bytes of the patches and of a call, in which the edges of a block or the decoder are largest."""
         assert isinstance(config, LayersNetConfig)
-        patches = sum(self.geometry(garment, config).count for garment in sizes.garments)
+        patches = sum(self.geometry(garment, config).patches for garment in sizes.garments)
         vertices = sum(len(garment.vertices) for garment in sizes.garments)
         width, half = config.embedding, config.embedding // 2  # about half of the heads see the world
         if sizes.cpu:  # only what there is
             bodies, mesh, world, pairs = min(sizes.body_vertices, int(BODIES * patches)), MESH, WORLD, DECODED
         else:
-            bodies, mesh, world, pairs = sizes.body_vertices, PADDED_MESH, config.patch_neighbours + BODY, VERTEX_PATCHES
+            bodies, mesh, world, pairs = (
+                sizes.body_vertices,
+                PADDED_MESH,
+                config.patch_neighbours + BODY,
+                VERTEX_PATCHES,
+            )
         tokens = patches + bodies + 2 * len(sizes.garments)
         edges = patches * half * max(8 * (world + 2), 6 * mesh)
         block = 6 * tokens * width + max(edges, 2 * tokens * config.feed_forward)

@@ -44,7 +44,7 @@ class Edges(NamedTuple):
     """What the patches see."""
 
     world: Links  # patches that world edges join, then body vertices, wind, gravity
-    counts: tuple[int, int, int, int]  # number of links of each of these
+    counts: tuple[int, ...]  # number of links of each of these four
     rotation: torch.Tensor  # [E',3,3], R of those after the patches
     mesh: Links  # mesh patches and the tokens of attributes
 
@@ -85,9 +85,9 @@ class Block(nn.Module):
         sender = self.send(value) + self.remember(tokens.sender) + tokens.sender
 
         wide = self.world * self.head
-        parts = [(part[:, :wide], part[:, wide:]) for part in (query, receiver, sender)]
-        world, mesh = zip(*parts, strict=True)
-        seen = torch.cat([self._seen(*world, edges.world, edges), self._seen(*mesh, edges.mesh, None)], dim=1)
+        world = self._seen(query[:, :wide], receiver[:, :wide], sender[:, :wide], edges.world, edges)
+        mesh = self._seen(query[:, wide:], receiver[:, wide:], sender[:, wide:], edges.mesh, None)
+        seen = torch.cat([world, mesh], dim=1)
         update = self.out(self.gain * seen + self.offset)
         value = self.attention_norm(torch.cat([value[:patches] + update, value[patches:]]))
         value = self.feed_forward_norm(value + self.contract(torch.relu(self.expand(value))))
@@ -127,9 +127,7 @@ class Block(nn.Module):
             seen = torch.cat([both[:plain], turned_ones.to(both.dtype)]) * weight
         return torch.zeros_like(q, dtype=seen.dtype).index_add(0, links.patch, seen)
 
-    def turned_values(
-        self, values: torch.Tensor, rotation: torch.Tensor, counts: tuple[int, ...]
-    ) -> torch.Tensor:
+    def turned_values(self, values: torch.Tensor, rotation: torch.Tensor, counts: tuple[int, ...]) -> torch.Tensor:
         """R_h^T relu(L (R_h f)) of the senders with a direction.
 
         Args:

@@ -1,9 +1,10 @@
 """Patches of a garment as LayersNet has them: clusters of faces, and the vertices that these touch.
 
 The faces are divided by their nearest centre of the project's geodesic patches (`nn/patches/layout.py`), which are 7
-to 8 cm wide with a spacing of 5.5 cm, and 11 cm with one of 8 cm. A vertex belongs to every patch whose faces it touches; its own is the one with
-the nearest mean in the rest pose. A patch's state is the mean of its vertices. Mesh edges join patches that share a
-vertex, or two of whose vertices are joined by an edge of the mesh; a patch is joined to itself.
+to 8 cm wide with a spacing of 5.5 cm, and 11 cm with one of 8 cm. A vertex belongs to every patch whose faces it
+touches; its own is the one with the nearest mean in the rest pose. A patch's state is the mean of its vertices. Mesh
+edges join patches that share a vertex, or two of whose vertices are joined by an edge of the mesh; a patch is joined to
+itself.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class ClothPatches(NamedTuple):
     own: np.ndarray  # int64 [V], the own patch of each vertex
     edge: np.ndarray  # int64 [E,2], mesh edges between patches in both directions, with (p,p), sorted
     gradient: np.ndarray  # float32 [V,3], w with sum_v x_v w_v^T = integral of the deformation gradient [m]
-    count: int  # number of patches P
+    patches: int  # number of patches P
 
 
 class ClothLayout(NamedTuple):
@@ -110,7 +111,7 @@ def _gradient(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def cloth_layout(patches: Sequence[ClothPatches], device: torch.device) -> ClothLayout:
     """The patches of several garments, end to end, as tensors on a device."""
     vertices = np.cumsum([0] + [len(p.own) for p in patches])
-    starts = np.cumsum([0] + [p.count for p in patches])
+    starts = np.cumsum([0] + [p.patches for p in patches])
     total = int(starts[-1])
     patch = np.concatenate([p.patch + s for p, s in zip(patches, starts, strict=False)])
     edge = np.concatenate([p.edge + s for p, s in zip(patches, starts, strict=False)])

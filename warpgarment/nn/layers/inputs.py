@@ -1,4 +1,4 @@
-r"""What LayersNet sees of a frame: states, directions and descriptors of each outfit, in a frame that moves with its body.
+r"""What LayersNet sees: states, directions and descriptors of each outfit, in a frame that moves with its body.
 
 An outfit is all garments on one body. Its root r is the mean of the body's vertices, its heading G turns the garments
 to heading zero (heading.py; the identity with `heading="world"`), from M = integral of the deformation gradient over

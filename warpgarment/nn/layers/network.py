@@ -135,7 +135,9 @@ class LayersNet(GarmentNetwork):
             received = tokens.value[: cloth.patches]
             body_token = encoded[0][cloth.patches :]
         with torch.autocast(kind, enabled=False):
-            return self._decode(view, cloth, state, patch, received.to(state.dtype), body_token.to(state.dtype), nearest)
+            return self._decode(
+                view, cloth, state, patch, received.to(state.dtype), body_token.to(state.dtype), nearest
+            )
 
     def observed(self, inputs: FrameInputs, layout: LayersLayout, after: torch.Tensor) -> dict[str, torch.Tensor]:
         """States of garments and bodies together, and accelerations; see `GarmentNetwork.observed`."""
@@ -282,9 +284,7 @@ def _links(tables: list[torch.Tensor]) -> tuple[Links, tuple[int, ...]]:
     return links, tuple(len(row) for row in rows)
 
 
-def _used(
-    near: torch.Tensor, of_vertex: torch.Tensor, count: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _used(near: torch.Tensor, of_vertex: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Body vertices that are seen, and the arguments as numbers of these.
 
     On a CPU only these become tokens, a part of the body. A GPU would have to wait for their number, and takes all.

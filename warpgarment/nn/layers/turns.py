@@ -1,6 +1,6 @@
 r"""Rotations of space, and the rotations of hidden vectors that stand for them.
 
-**Frames.** R turns a direction d to a fixed one, up for body normals and for wind, down for gravity, by the shortest way:
+**Frames.** R turns a direction d to a fixed one, up for body normals and for wind, down for gravity, the shortest way:
 
     R = I + [v]_x + [v]_x^2 / (1 + c),      v = d x e,  c = d . e
 
@@ -113,7 +113,7 @@ class Bases(nn.Module):
         Args:
             bases: Some rows of the result of `forward`, shape [H,w,k].
         """
-        heads, width, inner = bases.shape
+        heads, width = bases.shape[:2]
         eye = torch.eye(heads, dtype=bases.dtype, device=bases.device)
         blocks = bases[:, :, None, :] * eye[:, None, :, None]  # [H,w,H,k]
         whole = 3 * self.triples
