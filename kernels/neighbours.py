@@ -48,7 +48,7 @@ def nearest_points_kernel(
     if not wp.isfinite(point):
         return
     query = wp.hash_grid_query(grid, point, radius, group[i])
-    target = 0
+    target = wp.int32(0)  # not a constant
     while wp.hash_grid_query_next(query, target):
         d = wp.length(targets[target] - point)
         if not d <= radius:
