@@ -10,9 +10,11 @@ import torch
 from reference.layersnet import Twin
 from scipy.spatial.transform import Rotation
 from support.outfits import answer, inner, inputs_of, layersnet, layout_of, moving, outer, turned_motion
-from support.scenes import walk
+from support.scenes import body, walk
 
+from warpgarment.nn.layers.config import LayersNetConfig
 from warpgarment.nn.layers.inputs import acceleration, positions, seen
+from warpgarment.nn.layers.network import LayersNet
 from warpgarment.nn.patches.layout import garment_patches
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
@@ -195,7 +197,32 @@ def test_gradients_reach_everything():
 
 def test_sizes():
     """The published form would have another number of parameters than the 1.02 million that it is said to have."""
-    from warpgarment.nn.layers.config import LayersNetConfig
-    from warpgarment.nn.layers.network import LayersNet
-
     assert abs(LayersNet(LayersNetConfig.paper()).parameter_count() / 1.02e6 - 1) < 0.03
+
+
+def test_half_precision():
+    """`half=True` would fail, or be no approximation: the tokens are in bfloat16, states and positions are not.
+
+    2e-4 m: accelerations of millimetres, of which bfloat16 has two to three digits.
+    """
+    network, outfit = layersnet(), moving()
+    garments, inputs = inputs_of([outfit], torch.float32)
+    layout = layout_of(network, garments)
+    with torch.no_grad():
+        plain = network.predict(inputs, layout).positions
+        half = network.predict(inputs, layout, bfloat16=True).positions
+    assert half.dtype == torch.float32
+    assert 0 < (half - plain).abs().max() < 2e-4
+
+
+def test_pins_and_contact():
+    """A pinned vertex would leave its place, or cloth would be left in the body. 1e-6 m and 1 mm."""
+    garment = inner()
+    held = Garment(garment.vertices, garment.faces, pins=np.arange(14, dtype=np.int32))
+    motion = walk(6)
+    result = Simulator(layersnet(), "cpu").rollout([held, outer()], motion)[0]
+    assert result.status[-1].finite
+    assert result.status[-1].max_penetration < 1e-3
+    still = Simulator(layersnet(), "cpu", collision_passes=0).rollout(held, body(6)).vertices
+    assert np.abs(still[:, :14] - held.vertices[:14]).max() < 1e-6
+    assert np.abs(still[-1, 14:] - held.vertices[14:]).max() > 1e-3

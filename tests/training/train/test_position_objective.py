@@ -12,12 +12,16 @@ import torch
 from support import sequences
 from support.runs import config_for, entries_of
 
+from warpgarment.errors import MeshError
 from warpgarment.nn import checkpoint
 from warpgarment.nn.inputs import VertexStep
 from warpgarment.nn.layers.config import LayersNetConfig
 from warpgarment.nn.layers.network import LayersNet
+from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.material import Material
+from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.rollouts import predict
 from warpgarment.training.samples.noise import NoiseConfig
 from warpgarment.training.samples.outfits import OutfitBuilder, OutfitData
 from warpgarment.training.samples.statistics import position_statistics
@@ -317,3 +321,29 @@ def test_settings_that_do_not_fit():
         PositionConfig(body=-1)
     with pytest.raises(ValueError, match=r"outfit.rollout must be at most 64, got 100"):
         PositionConfig(rollout=100)
+
+
+@pytest.mark.parametrize("cold", [True, False])
+def test_recorded_outfits_are_rolled_out_garment_by_garment(data, cold):
+    """Validation would simulate an outfit as one garment, or without its wind and materials. Bit for bit."""
+    sequence, simulator = Sequence.load(data / "d"), Simulator(network_of(), "cpu")
+    newest, first = 4, 4 if cold else 2
+    found = predict(simulator, sequence, newest, 5, cold=cold)
+    garments = list(sequence.worn)
+    assert [len(garment.vertices) for garment in garments] == [len(sequence.garment.vertices) // 2] * 2
+    assert sequence.materials == (MATERIAL, None)
+    body = sequence.body()
+    part = BodyMotion(body.vertices[first:10], body.faces, body.fps)
+    known = [np.array(sequence.vertices[first : newest + 1, layer.vertices]) for layer in sequence.layers]
+    start = {"first_vertices": [k[0] for k in known]} if cold else {"history": known}
+    direct = simulator.rollout(garments, part, materials=[MATERIAL, None], wind=sequence.wind[first:10], **start)
+    for layer, motion in zip(sequence.layers, direct, strict=True):
+        np.testing.assert_array_equal(found[:, layer.vertices], motion.vertices[newest + 1 - first :])
+
+
+def test_a_material_that_is_none(data, tmp_path):
+    """A manifest of nonsense would end in a stack trace."""
+    wrong = {"garments": [GARMENTS[0], {"name": "outer", "material": {"density": -1.0}}]}
+    sequence = Sequence.load(sequences.write(tmp_path, "e", frames=8, spoil=two_layers, manifest=wrong))
+    with pytest.raises(MeshError, match=r"e: material of outer: a material's density must be positive"):
+        _ = sequence.materials

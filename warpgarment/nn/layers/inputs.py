@@ -87,7 +87,8 @@ def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool
 
     speed = [root[0] - root[1], root[1] - root[2], root[2] - root[3]]
     pull = [speed[0] - speed[1], speed[1] - speed[2]]  # accelerations at t+1 and t
-    down = relative[0].new_tensor([0.0, -GRAVITY / fps**2, 0.0])
+    down = relative[0].new_zeros(3)
+    down[1] = -GRAVITY / fps**2  # a kernel, no copy from the host
     gravity = torch.stack([_turned(down - part, heading) for part in pull], dim=1)
 
     count, turn = len(of_garment), heading[of_garment]

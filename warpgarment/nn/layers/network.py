@@ -304,5 +304,5 @@ def _real(chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         row, column = (chosen >= 0).nonzero(as_tuple=True)
         return row, column
     rows, columns = chosen.shape
-    row = torch.arange(rows, device=chosen.device).repeat_interleave(columns, output_size=rows * columns)
+    row = torch.arange(rows, device=chosen.device)[:, None].expand(rows, columns).flatten()
     return row, torch.arange(columns, device=chosen.device).repeat(rows)

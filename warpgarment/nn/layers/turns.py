@@ -42,7 +42,8 @@ def frames(directions: torch.Tensor, height: float = 1.0) -> torch.Tensor:
     eye = torch.eye(3, dtype=d.dtype, device=d.device)
     near = (1.0 + c) > OPPOSITE
     turned = eye + cross + cross @ cross / torch.where(near, 1.0 + c, 1.0)[..., None, None]
-    half = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=d.dtype)).to(d.device)
+    half = -eye
+    half[0, 0] = 1.0  # a kernel, no copy from the host
     turned = torch.where(near[..., None, None], turned, half)
     return torch.where((d == 0.0).all(-1)[..., None, None], eye, turned)
 
@@ -56,7 +57,8 @@ def quaternions(directions: torch.Tensor) -> torch.Tensor:
     zero = torch.zeros_like(x)
     found = torch.stack([w, torch.where(near, -z, 1.0), zero, torch.where(near, x, 0.0)], dim=-1)
     found = found / found.square().sum(-1, keepdim=True).sqrt()
-    rest = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=d.dtype).to(d.device)
+    rest = torch.zeros(4, dtype=d.dtype, device=d.device)
+    rest[0] = 1.0
     return torch.where((d == 0.0).all(-1, keepdim=True), rest, found)
 
 
