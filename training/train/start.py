@@ -106,13 +106,22 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
 
 
 def make_builder(config: TrainConfig, network: GarmentNetwork, sequences: list) -> SampleBuilder | OutfitBuilder:
-    """The builder of single-step samples, or of outfits for a network that predicts positions."""
+    """The builder of single-step samples, or of outfits for a network that predicts positions.
+
+    Raises:
+        ValueError: The network predicts positions, and its kind does not say so.
+    """
     if architecture(network.config.architecture).positions:
         less = config.outfit.noise
         noise = dataclasses.replace(
             config.noise, position=less * config.noise.position, offset=less * config.noise.offset
         )
         return OutfitBuilder(sequences, network, noise, config.outfit.rollout, config.unroll.steps)
+    if type(network).forward_normalised is GarmentNetwork.forward_normalised:
+        raise ValueError(
+            f"a {type(network).__name__} has no forward_normalised, so it is not trained on steps of faces. If it "
+            f"predicts positions, set positions = True in its Architecture ({network.config.architecture!r})"
+        )
     return SampleBuilder(sequences, network.config, config.noise, config.augmentation)
 
 

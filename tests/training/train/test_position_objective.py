@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
+import types
 
 import igl
 import numpy as np
@@ -14,9 +16,12 @@ from support.runs import config_for, entries_of
 
 from warpgarment.errors import MeshError
 from warpgarment.nn import checkpoint
+from warpgarment.nn.architecture import ARCHITECTURES, Architecture
+from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import VertexStep
 from warpgarment.nn.layers.config import LayersNetConfig
 from warpgarment.nn.layers.network import LayersNet
+from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.material import Material
 from warpgarment.sim.simulator import Simulator
@@ -28,6 +33,7 @@ from warpgarment.training.samples.statistics import position_statistics
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.position_objective import PositionConfig, PositionObjective, vertex_normals
 from warpgarment.training.train.start import train
+from warpgarment.training.train.unrolled_objective import UnrollConfig
 
 CPU = torch.device("cpu")
 SMALL = {"embedding": 32, "layers": 1, "feed_forward": 32, "heads": 4, "world_heads": 2, "decoder": 32}
@@ -347,3 +353,50 @@ def test_a_material_that_is_none(data, tmp_path):
     sequence = Sequence.load(sequences.write(tmp_path, "e", frames=8, spoil=two_layers, manifest=wrong))
     with pytest.raises(MeshError, match=r"e: material of outer: a material's density must be positive"):
         _ = sequence.materials
+
+
+class Drift(GarmentNetwork):
+    """Every vertex moves on at one learned speed."""
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.speed = torch.nn.Parameter(torch.zeros(3))
+
+    def layout(self, garments, packed, *, face_splits=1):
+        return None
+
+    def predict(self, inputs, layout, *, bfloat16=False):
+        return VertexStep(inputs.vertices + self.speed)
+
+
+class DriftArchitecture(Architecture):
+    config, subsets = NetworkConfig, False
+
+    def build(self, config):
+        return Drift(config)
+
+    def memory(self, sizes, config):
+        return {"network": 0}
+
+    def flops(self, config, faces, components, rows):
+        return 0, 0
+
+
+@pytest.mark.parametrize("positions", [True, False])
+def test_any_network_that_predicts_positions(data, tmp_path, monkeypatch, positions):
+    """A user's network of positions could not be trained, on several steps in a row too; or would end in a stack trace
+    if its kind does not say what it predicts."""
+    module = types.ModuleType("drift")
+    module.ARCHITECTURE = DriftArchitecture()
+    module.ARCHITECTURE.positions = positions
+    monkeypatch.setitem(sys.modules, "drift", module)
+    monkeypatch.setitem(ARCHITECTURES, "drift", "drift")
+    module.ARCHITECTURE.presets = {"drift": NetworkConfig(architecture="drift", history=3)}
+    options = {"network": "drift", "overrides": (), "steps": 4, "batch_size": 2, "outfit": PositionConfig(rollout=1)}
+    config = config_for(data, tmp_path / "run", **options, unroll=UnrollConfig(steps=2))
+    if not positions:
+        with pytest.raises(ValueError, match=r"a Drift has no forward_normalised.* set positions = True"):
+            train(config)
+        return
+    found = checkpoint.load(train(config))
+    assert found.speed.abs().min() > 1e-5
