@@ -77,8 +77,8 @@ class Block(nn.Module):
         self.attention_norm, self.feed_forward_norm = nn.LayerNorm(width), nn.LayerNorm(width)
         self.expand, self.contract = nn.Linear(width, config.feed_forward), nn.Linear(config.feed_forward, width)
 
-    def forward(self, tokens: Tokens, edges: Edges) -> Tokens:
-        """The tokens after the block."""
+    def forward(self, tokens: Tokens, edges: Edges, *, last: bool = False) -> Tokens:
+        """The tokens after the block; with `last` only those of patches, as nothing reads the others then."""
         value, patches = tokens.value, len(tokens.receiver)
         query = self.query(value[:patches])
         receiver = self.receive(value[:patches]) + self.remember(tokens.receiver) + tokens.receiver
@@ -89,7 +89,8 @@ class Block(nn.Module):
         mesh = self._seen(query[:, wide:], receiver[:, wide:], sender[:, wide:], edges.mesh, None)
         seen = torch.cat([world, mesh], dim=1)
         update = self.out(self.gain * seen + self.offset)
-        value = self.attention_norm(torch.cat([value[:patches] + update, value[patches:]]))
+        update = value[:patches] + update
+        value = self.attention_norm(update if last else torch.cat([update, value[patches:]]))
         value = self.feed_forward_norm(value + self.contract(torch.relu(self.expand(value))))
         return Tokens(value, receiver, sender)
 

@@ -32,7 +32,7 @@ class LayersNetConfig(NetworkConfig):
 
     embedding: int = 128
     layers: int = 4
-    feed_forward: int = 256
+    feed_forward: int = 128
     heads: int = 8
     manifold_heads: int = 0
     dropout: float = 0.0
@@ -76,6 +76,7 @@ class LayersNetConfig(NetworkConfig):
         settings: dict[str, Any] = {
             "residual": False,
             "heading": "world",
+            "feed_forward": 256,
             "decoder": 268,
             "rotation": "published",
             "patch_spacing": 0.055,

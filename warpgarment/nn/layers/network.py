@@ -130,9 +130,9 @@ class LayersNet(GarmentNetwork):
             sent = [self.senders[name](part) for name, part in zip(KINDS, encoded, strict=True)]
             values = torch.cat(encoded)
             tokens = Tokens(values, self.receiver(values[: cloth.patches]), torch.cat(sent))
-            for block in self.blocks:
-                tokens = block(tokens, edges)
-            received = tokens.value[: cloth.patches]
+            for number, block in enumerate(self.blocks, 1):
+                tokens = block(tokens, edges, last=number == len(self.blocks))
+            received = tokens.value
             body_token = encoded[0][cloth.patches :]
         with torch.autocast(kind, enabled=False):
             return self._decode(
