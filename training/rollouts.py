@@ -19,7 +19,8 @@ the skinned garment is tied to the body everywhere, and the rigid one nowhere.
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Protocol, cast
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import igl
 import numpy as np
@@ -33,6 +34,7 @@ from warpgarment.kernels.deformation.svd import rotation
 from warpgarment.kernels.mesh.laplacian import components
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
+from warpgarment.objects.material import Material
 
 if TYPE_CHECKING:
     from warpgarment.sim.simulator import Simulator
@@ -72,6 +74,26 @@ def check_rate(recorded: float, network: float) -> None:
             f"the recording runs at {recorded:g} frames a second and the network at {network:g}: bring it to that rate "
             "with Recording.resampled before it is written as a sequence."
         )
+
+
+class RecordedOutfit(Recorded, Protocol):
+    """Several garments, as a `Sequence` of a data set has them."""
+
+    @property
+    def layers(self) -> Sequence[Any]:
+        """Entries with the range `vertices` of each garment."""
+
+    @property
+    def worn(self) -> Sequence[Garment]:
+        """The garments."""
+
+    @property
+    def materials(self) -> Sequence[Material | None]:
+        """Their materials."""
+
+    @property
+    def wind(self) -> np.ndarray | None:
+        """Velocity of the air in each frame [m/s], [T,3]."""
 
 
 def predict(
@@ -114,11 +136,42 @@ def predict(
     part = BodyMotion(body.vertices[first : newest + steps + 1], body.faces, body.fps)
     with warnings.catch_warnings():  # a rollout that fails is visible in the figures
         warnings.simplefilter("ignore", RuntimeWarning)
-        motion = simulator.rollout(sequence.garment, part, first_vertices=start, history=known)
+        if simulator.network.reads & {"materials", "wind"}:
+            moved = _outfit(simulator, cast(RecordedOutfit, sequence), part, first, start, known)
+        else:
+            moved = simulator.rollout(sequence.garment, part, first_vertices=start, history=known).vertices
     predicted = np.full((steps, *sequence.vertices.shape[1:]), np.nan, np.float32)
-    moved = np.asarray(motion.vertices)[newest + 1 - first :]
+    moved = np.asarray(moved)[newest + 1 - first :]
     predicted[: len(moved)] = moved
     return predicted
+
+
+def _outfit(
+    simulator: Simulator,
+    sequence: RecordedOutfit,
+    body: BodyMotion,
+    first: int,
+    start: np.ndarray | None,
+    known: np.ndarray | None,
+) -> np.ndarray:
+    """Rolls an outfit out garment by garment, with its materials and wind; the arguments are those of `predict`.
+
+    Returns:
+        Vertices [m], float32 [T,V,3]; a garment that has stopped is NaN.
+    """
+    parts = [layer.vertices for layer in sequence.layers]
+    motions = simulator.rollout(
+        list(sequence.worn),
+        body,
+        first_vertices=None if start is None else [start[part] for part in parts],
+        history=None if known is None else [known[:, part] for part in parts],
+        materials=list(sequence.materials),
+        wind=None if sequence.wind is None else sequence.wind[first : first + len(body.vertices)],
+    )
+    moved = np.full((body.frames, len(sequence.garment.vertices), 3), np.nan, np.float32)
+    for part, motion in zip(parts, motions, strict=True):
+        moved[: len(motion.vertices), part] = motion.vertices
+    return moved
 
 
 NEIGHBOURS = 8

@@ -9,10 +9,13 @@ if TYPE_CHECKING:
     from warpgarment.nn import checkpoint
     from warpgarment.nn.config import NetworkConfig
     from warpgarment.nn.faces.network import ManifoldAwareTransformer
+    from warpgarment.nn.layers.config import LayersNetConfig
+    from warpgarment.nn.layers.network import LayersNet
     from warpgarment.nn.patches.network import PatchTransformer
     from warpgarment.objects.body import BodyMotion
     from warpgarment.objects.fit import fit
     from warpgarment.objects.garment import Garment
+    from warpgarment.objects.material import Material
     from warpgarment.objects.motion import GarmentMotion
     from warpgarment.objects.status import RolloutStatus, Verdict
     from warpgarment.sim.simulator import Simulator
@@ -30,7 +33,10 @@ __all__ = [
     "CheckpointError",
     "Garment",
     "GarmentMotion",
+    "LayersNet",
+    "LayersNetConfig",
     "ManifoldAwareTransformer",
+    "Material",
     "MeshError",
     "MissingExtra",
     "NetworkConfig",
@@ -56,7 +62,10 @@ _HOME = {
     "CheckpointError": "errors",
     "Garment": "objects.garment",
     "GarmentMotion": "objects.motion",
+    "LayersNet": "nn.layers.network",
+    "LayersNetConfig": "nn.layers.config",
     "ManifoldAwareTransformer": "nn.faces.network",
+    "Material": "objects.material",
     "MeshError": "errors",
     "MissingExtra": "errors",
     "NetworkConfig": "nn.config",

@@ -26,7 +26,7 @@ from warpgarment.nn.inputs import FrameInputs, NetworkSizes
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.objects.pack import PackedGarments
+from warpgarment.objects.pack import PackedBodies, PackedGarments
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.start import train
@@ -34,6 +34,7 @@ from warpgarment.training.train.start import train
 TINY = {"embedding": 16, "layers": 1, "feed_forward": 16, "heads": 2, "manifold_heads": 1, "history": 3, "dropout": 0.0}
 TINY |= {"geodesic_power": 2.0, "geodesic_radius": 0.2, "patch_spacing": 0.15, "residual": True, "norm_first": True}
 TINY |= {"face_embedding": 16, "face_feed_forward": 16, "face_layers": 1, "heading": "canonical"}
+OWN = {"layers": {"world_heads": 1, "body_radius": 0.25, "patch_radius": 0.2, "decoder": 16}}
 CPU = torch.device("cpu")
 
 every_kind = pytest.mark.parametrize("kind", ARCHITECTURES)
@@ -41,7 +42,7 @@ every_kind = pytest.mark.parametrize("kind", ARCHITECTURES)
 
 def settings(kind: str, **changes) -> NetworkConfig:
     """The first named shape of a kind, made tiny."""
-    return dataclasses.replace(next(iter(architecture(kind).presets.values())), **(TINY | changes))
+    return dataclasses.replace(next(iter(architecture(kind).presets.values())), **(TINY | OWN.get(kind, {}) | changes))
 
 
 def made(kind: str, **changes) -> GarmentNetwork:
@@ -50,8 +51,9 @@ def made(kind: str, **changes) -> GarmentNetwork:
     network = build_network(settings(kind, **changes))
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
-    scales = {"psi_std": (9, 0.02), "singular_value_std": (3, 2e-3), "q_std": (3, 2e-3)}
-    network.set_statistics({name: torch.full((length,), value) for name, (length, value) in scales.items()})
+    scales = {"psi_std": 0.02, "singular_value_std": 2e-3, "q_std": 2e-3, "acceleration_std": 2e-4}
+    lengths = network.statistics
+    network.set_statistics({name: torch.full((lengths[name],), v) for name, v in scales.items() if name in lengths})
     return network.eval()
 
 
@@ -131,7 +133,8 @@ def test_a_batch_is_its_garments_alone(kind):
     2e-5 m: float32 sums of other lengths, four frames.
     """
     garments, network = [skirt(), outfit(), skirt()], made(kind)
-    together = rollout(network, garments, walk(5))
+    bodies = [walk(5) for _ in garments]  # garments on one body may see each other
+    together = rollout(network, garments, bodies)
     for garment, motion in zip(garments, together, strict=True):
         assert np.abs(motion.vertices - rollout(network, garment, walk(5)).vertices).max() < 2e-5
 
@@ -142,6 +145,9 @@ def test_face_splits(kind, splits):
     """A kind that needs whole garments would get parts of them, or a kind that can take parts would not."""
     packed = PackedGarments.pack([skirt()], CPU)
     layout = made(kind).layout([skirt()], packed, face_splits=splits)
+    if architecture(kind).positions:
+        assert layout.cloth.patches == made(kind).layout([skirt()], packed).cloth.patches
+        return
     rows = sum(len(view.face_index) for view in layout.views)
     assert rows == (splits if architecture(kind).subsets else 1)
     assert torch.equal(layout.face_component, packed.face_component)
@@ -153,13 +159,14 @@ def test_a_training_step(kind, splits, tmp_path):
     """A kind could be simulated with but not trained, on parts of garments or on whole ones."""
     data = synthetic_sequences.write_set(tmp_path / "set", train=2, frames=8)
     name = next(iter(architecture(kind).presets))
-    shape = tuple(f"{key}={value}" for key, value in TINY.items())
+    shape = tuple(f"{key}={value}" for key, value in (TINY | OWN.get(kind, {})).items())
     options = {"network": name, "overrides": shape, "steps": 2, "splits": splits, "batch_size": 2, "lr": 1e-2}
     path = train(config_for(data, tmp_path / "run", **options))
     assert all(np.isfinite(list(losses_of(tmp_path / "run").values())))
     trained = checkpoint.load(path)
     assert trained.config == settings(kind)
-    assert trained.face_head.weight.any()  # a residual network starts at zero
+    last = trained.decoder[-1] if architecture(kind).positions else trained.face_head
+    assert last.weight.any()  # a residual network starts at zero
 
 
 @every_kind
@@ -180,14 +187,18 @@ def test_memory_is_within_its_forecast(kind, number):
     packed = PackedGarments.pack(garments, CPU)
     features = torch.randn(len(packed.faces), config.history, FACE.width)
     velocities = torch.zeros(packed.component_count, config.history - 1, 3)
-    body = torch.zeros(0, 3)
+    rest, beneath = packed.rest_vertices, garments[0]
+    bodies = PackedBodies.pack([beneath.faces], [len(beneath.vertices)], [0] * number, CPU)
+    body = torch.from_numpy((beneath.vertices * [0.9, 1.0, 0.9]).astype(np.float32))
+    past = {"previous": rest.expand(2, -1, -1), "previous_body": body.expand(2, -1, -1), "bodies": bodies}
 
     @torch.inference_mode()
     def call() -> None:
         layout = network.layout(garments, packed)
-        network.predict(FrameInputs(features, velocities, packed.rest_vertices, body, body), layout)
+        network.predict(FrameInputs(features, velocities, rest, body, body, **past), layout)
 
-    forecast = dict(architecture(kind).memory(NetworkSizes(garments, cpu=True), config))
+    sizes = NetworkSizes(garments, cpu=True, body_vertices=len(body))
+    forecast = dict(architecture(kind).memory(sizes, config))
     forecast.pop("geodesic distances", None)  # they are made up, before the count begins
     passing = max(forecast.pop(name, 0) for name in ("network", "making weights"))
     assert 1 / 1.5 < (sum(forecast.values()) + passing) / allocated(call) < 1.5
@@ -237,7 +248,7 @@ def test_settings_of_a_kind_of_its_own(tmp_path, monkeypatch):
 
 def test_names_that_there_are_not():
     """A misspelt kind would end in a stack trace of an import."""
-    with pytest.raises(ValueError, match='architecture must be "faces" or "patches", got \'tokens\''):
+    with pytest.raises(ValueError, match='architecture must be "faces", "patches" or "layers", got \'tokens\''):
         architecture("tokens")
     with pytest.raises(ValueError, match="got 'tokens'"):
         TrainConfig(Path(), Path(), overrides=("architecture=tokens",), steps=1).network_config()

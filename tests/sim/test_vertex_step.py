@@ -15,6 +15,7 @@ from warpgarment.nn.architecture import ARCHITECTURES, Architecture
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import VertexStep
 from warpgarment.nn.network import GarmentNetwork
+from warpgarment.objects.material import Material
 from warpgarment.sim.simulator import Simulator
 
 SPEED = torch.tensor([0.003, -0.004, 0.002])  # metres a frame
@@ -121,9 +122,9 @@ def test_a_network_that_reads_more_than_there_is():
     """A network would get None for an input that simulations do not have, and fail with an unclear error."""
 
     class Windy(Drift):
-        reads = frozenset({"wind", "materials"})
+        reads = frozenset({"wind", "pairs"})
 
-    with pytest.raises(ValueError, match="reads materials, wind, which simulations do not give yet"):
+    with pytest.raises(ValueError, match="reads pairs, which simulations do not give yet"):
         Simulator(drift(Windy), "cpu").rollout(skirt(), walk(2))
 
 
@@ -143,3 +144,75 @@ def test_the_mode_is_as_it_was(training):
     simulator.step(simulator.start(skirt(), motion.vertices[0], motion.faces), motion.vertices[1])
     assert seen == [False] * 3
     assert network.training == training
+
+
+class Witness(Drift):
+    """Keeps its inputs."""
+
+    reads = frozenset({"previous", "materials", "wind"})
+
+    def predict(self, inputs, layout, *, bfloat16=False):
+        self.seen = [*getattr(self, "seen", []), inputs]
+        return super().predict(inputs, layout)
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_earlier_frames_materials_and_wind(live):
+    """A network would get frames, wind or materials of other times or garments. Bit for bit."""
+    network, motion, garments = drift(Witness), walk(5), [skirt(), skirt()]
+    simulator = Simulator(network, "cpu", collision_passes=0)
+    materials, wind = [None, Material(density=0.3)], np.arange(5 * 2 * 3, dtype=np.float32).reshape(5, 2, 3)
+    if live:
+        state = simulator.start(garments, motion.vertices[0], motion.faces, materials=materials, wind=wind[:1])
+        frames = [state.vertices]
+        for t in range(1, 5):
+            state = simulator.step(state, motion.vertices[t], wind=wind[t : t + 1])
+            frames.append(state.vertices)
+        frames = [np.concatenate(frame) for frame in frames]
+    else:
+        results = simulator.rollout(garments, motion, materials=materials, wind=wind)
+        frames = list(np.concatenate([result.vertices for result in results], axis=1))
+    assert len(network.seen) == 4
+    for t, seen in enumerate(network.seen):
+        for k in (0, 1):
+            np.testing.assert_array_equal(seen.previous[k], frames[max(t - 1 - k, 0)])
+            np.testing.assert_array_equal(seen.previous_body[k], motion.vertices[max(t - 1 - k, 0)].astype(np.float32))
+        np.testing.assert_array_equal(seen.wind[0], wind[t + 1])
+        np.testing.assert_array_equal(seen.wind[1], wind[t])
+        assert seen.materials[0].isnan().all()
+        assert seen.materials[1].tolist() == pytest.approx(list(vars(Material(density=0.3)).values()))
+        assert seen.bodies.body_of_garment.tolist() == [0, 0]
+
+
+def test_wind_holds_on_after_a_history():
+    """Wind that is shorter than a motion would end, or a warm start would take that of the first frame."""
+    network, motion = drift(Witness), walk(6)
+    history = np.repeat(skirt().vertices[None], 3, axis=0)
+    wind = np.arange(5 * 3, dtype=np.float32).reshape(5, 3)
+    Simulator(network, "cpu", collision_passes=0).rollout(skirt(), motion, history=history, wind=wind)
+    assert [seen.wind[:, 0].tolist() for seen in network.seen] == [
+        [wind[min(t + 1, 4)].tolist(), wind[t].tolist()] for t in (2, 3, 4)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"wind": [1.0, np.nan, 0.0]}, "wind holds NaN"),
+        ({"wind": [0.0, 0.0, 1000.0]}, "wind of 1,000 m/s; it must be at most 100"),
+        ({"wind": np.zeros((4, 3, 3))}, "wind must have shape"),
+        ({"materials": [Material(), Material()]}, "1 garments and 2 materials"),
+    ],
+)
+def test_senseless_materials_and_wind(options, message):
+    """A mistake would be simulated."""
+    with pytest.raises(ValueError, match=message):
+        Simulator(drift(Witness), "cpu").rollout(skirt(), walk(2), **options)
+
+
+@pytest.mark.parametrize("name", ["materials", "wind"])
+def test_a_network_that_does_not_read_them(name):
+    """Wind would be given and silently have no effect."""
+    given = {"materials": Material(), "wind": [1.0, 0.0, 0.0]}[name]
+    with pytest.raises(ValueError, match=f"{name} given, but a Drift reads none"):
+        Simulator(drift(), "cpu").rollout(skirt(), walk(2), **{name: given})

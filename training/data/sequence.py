@@ -26,6 +26,7 @@ from warpgarment.io.disk.plain import open_plain
 from warpgarment.io.npz import array_header
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
+from warpgarment.objects.material import Material
 
 from .encoding import decoded, encoded, stored_body, stored_transforms
 from .layout import AGAIN, ARRAYS, STORED, check_fit, expected
@@ -146,6 +147,36 @@ class Sequence:
             )
             for k in range(count)
         )
+
+    @cached_property
+    def worn(self) -> tuple[Garment, ...]:
+        """The garments one by one, innermost first, each with its own vertices, faces and pins."""
+        whole, found = self.garment, []
+        for layer in self.layers:
+            first, last = layer.vertices.start, layer.vertices.stop
+            pins = whole.pins[(whole.pins >= first) & (whole.pins < last)] - first
+            faces = whole.faces[layer.faces] - first
+            try:
+                found.append(Garment(whole.vertices[layer.vertices], faces, pins=pins, name=layer.name))
+            except MeshError as error:
+                raise MeshError(f"{self.name}: {layer.name}: {error}") from None
+        return tuple(found)
+
+    @cached_property
+    def materials(self) -> tuple[Material | None, ...]:
+        """The material of each garment; None where the manifest has none.
+
+        Raises:
+            MeshError: An entry of the manifest is not a material.
+        """
+        found = []
+        for layer in self.layers:
+            entry = layer.entry.get("material")
+            try:
+                found.append(None if entry is None else Material(**entry))
+            except (TypeError, ValueError) as error:
+                raise MeshError(f"{self.name}: material of {layer.name}: {error}") from None
+        return tuple(found)
 
     @property
     def starts(self) -> np.ndarray:

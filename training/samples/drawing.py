@@ -6,28 +6,35 @@ builds it.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
 
-from .noise import NoiseConfig
-from .recorded import SequenceData
+from .noise import NoiseBasis, NoiseConfig
 
 Built = TypeVar("Built", covariant=True)
+
+
+class Noised(Protocol):
+    """A training sequence whose history can be displaced."""
+
+    @property
+    def noise(self) -> NoiseBasis:
+        """Smooth random fields of its garments."""
 
 
 class Builder(Protocol[Built]):
     """The interface of a builder of batches for a loader.
 
     Attributes:
-        sequences: Training sequences.
+        sequences: Training sequences, `SequenceData` or `OutfitData`.
         device: Device of the sequences, and of the batches.
         subsets: Whether the network can always be trained on some of a garment's faces. If not, whole garments are
             built once garments are no longer split.
     """
 
-    sequences: list[SequenceData]
+    sequences: list[Any]
     device: torch.device
     subsets: bool
 
@@ -75,7 +82,7 @@ def part_of(
 
 
 def displacement(
-    sequence: SequenceData,
+    sequence: Noised,
     history: int,
     noise: NoiseConfig,
     rng: np.random.Generator,

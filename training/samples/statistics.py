@@ -8,8 +8,10 @@ import torch
 
 from warpgarment.nn.network import GarmentNetwork
 
+from .outfits import OutfitBatch
 from .single_step import Batch
 
+POSITION_FLOORS = {"state": 1e-3, "acceleration": 1e-4}  # [m] and [m/frame]; [m/frame^2]
 FLOORS = {"feature": 3e-3, "velocity": 1e-3, "psi": 1e-3, "singular_value": 1e-3, "q": 3e-4}  # least deviations
 
 
@@ -37,4 +39,23 @@ def statistics(batches: Iterable[Batch], network: GarmentNetwork) -> dict[str, t
         deviation = (values - mean.to(values.device)).square().mean(dim=0).sqrt()
         found[f"{name}_mean"] = mean.float()
         found[f"{name}_std"] = deviation.clamp(min=FLOORS[name]).float()
+    return found
+
+
+def position_statistics(batches: Iterable[OutfitBatch], network: GarmentNetwork) -> dict[str, torch.Tensor]:
+    """Means and standard deviations of what a network that predicts positions observes in some batches.
+
+    Deviations have lower bounds, as above.
+    """
+    samples: dict[str, list[torch.Tensor]] = {}
+    for batch in batches:
+        newest = batch.ahead + 2
+        inputs = batch.inputs(batch.recorded(newest), newest, network.reads)
+        for name, values in network.observed(inputs, batch.layout, batch.frames[newest + 1]).items():
+            samples.setdefault(name, []).append(values)
+    found = {}
+    for name, parts in samples.items():
+        values = torch.cat(parts).double()
+        found[f"{name}_mean"] = values.mean(dim=0).float()
+        found[f"{name}_std"] = values.std(dim=0, correction=0).clamp(min=POSITION_FLOORS.get(name, 1e-9)).float()
     return found

@@ -4,7 +4,7 @@ on one set of sequences."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
@@ -114,7 +114,7 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
     shape = "small" if config.network == "default" else config.network
     if shape not in SHAPES:
         raise OptionMissing(f"{config.table} trains networks of its own; --network is their shape: {', '.join(SHAPES)}")
-    common = _common(config, cast(Literal["small", "base", "fast"], shape))
+    common = _common(config, shape)
     variants.check_different({"all": common})  # raises an error if an override does not exist
     if config.table == "recipe":
         rows = recipe.recipe(common)
@@ -127,7 +127,7 @@ def plan(config: Any) -> tuple[dict[str, TrainConfig], list[variants.Variant]]:
     return configs, rows
 
 
-def _common(config: Any, shape: Literal["small", "base", "fast"]) -> TrainConfig:
+def _common(config: Any, shape: Any) -> TrainConfig:
     """The training configuration from which all rows start."""
     options = config.tables
     common = TrainConfig(

@@ -14,6 +14,7 @@ from warpgarment.training.samples.noise import NoiseConfig
 from warpgarment.training.samples.pushforward import PushforwardConfig
 
 from .losses import LossConfig
+from .position_objective import PositionConfig
 from .unrolled_objective import UnrollConfig
 
 
@@ -24,8 +25,8 @@ class TrainConfig:
     Attributes:
         data: Folder of sequences.
         out: Folder for all output of the run.
-        network: Named shape of the network; "fast" is a network of patches of cloth, the others have a token for every
-            face.
+        network: Named shape of the network; "fast" is a network of patches of cloth, "layersnet" one for layered
+            outfits in the wind ("layersnet-paper" in its published form), the others have a token for every face.
         overrides: Changes to that shape, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
         init: Checkpoint to start from instead of random weights; its shape and statistics are kept. A file, a folder,
             or the name of a network that ships. A network of patches can also start from one of faces with the same
@@ -63,7 +64,7 @@ class TrainConfig:
 
     data: Path
     out: Path
-    network: Literal["small", "base", "fast"] = "small"
+    network: Literal["small", "base", "fast", "layersnet", "layersnet-paper"] = "small"
     overrides: tuple[str, ...] = ("dropout=0.0",)
     init: Path | None = None
     grow: bool = False
@@ -85,6 +86,7 @@ class TrainConfig:
     pushforward: PushforwardConfig = field(default_factory=PushforwardConfig)
     unroll: UnrollConfig = field(default_factory=UnrollConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+    outfit: PositionConfig = field(default_factory=PositionConfig)
     validate_every: int = 500
     validate_frames: int = 60
     validate_sequences: int = 3
@@ -108,6 +110,8 @@ class TrainConfig:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
 
+        if self.compile and architecture(self.network_config().architecture).positions:
+            raise ValueError("networks that predict positions are not compiled: leave out compile")
         if self.unroll.steps > 1 and self.compile:
             raise ValueError("unrolled training is not compiled: leave out compile, or set unroll.steps to 1")
         if self.unroll.steps > 1 and self.augmentation.scale:

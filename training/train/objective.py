@@ -20,10 +20,12 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import NetworkOutput
 from warpgarment.nn.run import run
 from warpgarment.training.distributed import Group
+from warpgarment.training.samples.outfits import OutfitBatch
 from warpgarment.training.samples.single_step import Batch
 from warpgarment.training.samples.unrolled import UnrolledBatch
 
 from .losses import LossConfig, loss
+from .position_objective import PositionObjective
 from .unrolled_objective import UnrolledObjective
 
 
@@ -93,7 +95,9 @@ class Trainer:
         compile: Whether to compile the objective.
     """
 
-    def __init__(self, objective: Objective | UnrolledObjective, group: Group, compile: bool) -> None:
+    def __init__(
+        self, objective: Objective | UnrolledObjective | PositionObjective, group: Group, compile: bool
+    ) -> None:
         self.compiled, self._worked = compile, False
         self._inputs: Callable[..., tuple] = objective.inputs  # from a batch to arguments of the objective
         if compile:
@@ -102,7 +106,7 @@ class Trainer:
         if group.size > 1:
             self._model = DistributedDataParallel(objective, gradient_as_bucket_view=True)
 
-    def backward(self, batch: Batch | UnrolledBatch) -> torch.Tensor:
+    def backward(self, batch: Batch | UnrolledBatch | OutfitBatch) -> torch.Tensor:
         """Computes the gradient of the weights; the host does not wait for the device.
 
         Returns:

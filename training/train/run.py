@@ -21,15 +21,17 @@ from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import predict
 from warpgarment.training.samples.drawing import Builder
 from warpgarment.training.samples.loader import Loader, Plan
+from warpgarment.training.samples.outfits import OutfitBatch, OutfitBuilder
 from warpgarment.training.samples.pushforward import Pool
 from warpgarment.training.samples.single_step import Batch, SampleBuilder
-from warpgarment.training.samples.statistics import statistics
+from warpgarment.training.samples.statistics import position_statistics, statistics
 from warpgarment.training.samples.unrolled import UnrolledBatch, UnrolledBuilder
 
 from . import state as training_state
 from .config import TrainConfig
 from .log import RunLog, json_number
 from .objective import Objective, Trainer
+from .position_objective import PositionObjective
 from .rate import Rate, spelt
 from .unrolled_objective import UnrolledObjective
 
@@ -54,7 +56,7 @@ class Run:
         config: Settings of the run.
         network: The network to train.
         plan: Samples of each batch.
-        builder: Builder of single-step samples.
+        builder: Builder of single-step samples, or of outfits for a network that predicts positions.
         validation: Sequences for validation, from `load_validation`.
         began: Time at which the run started, of `time.monotonic` [s].
         group: The processes that train together.
@@ -65,7 +67,7 @@ class Run:
         config: TrainConfig,
         network: GarmentNetwork,
         plan: Plan,
-        builder: SampleBuilder,
+        builder: SampleBuilder | OutfitBuilder,
         validation: list,
         began: float,
         group: Group,
@@ -74,8 +76,11 @@ class Run:
         self.out, self.group, self.device = Path(config.out), group, group.device
         self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
         steps, passes, ahead = config.unroll.steps, config.unroll.collision_passes, config.ahead
-        chosen: Builder[Batch | UnrolledBatch] = builder
-        if steps > 1:
+        chosen: Builder[Any] = builder
+        self.positions = isinstance(builder, OutfitBuilder)
+        if isinstance(builder, OutfitBuilder):
+            ahead = 0  # the search trees of a layout must stay in one thread
+        elif steps > 1:
             chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
             ahead = 0  # the solvers of a scene must stay in one thread
         self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
@@ -146,16 +151,25 @@ class Run:
             self.pool.step, self.recent = progress["pool_step"], progress.get("recent", [])
         elif config.init is None and group.first:
             steps = range(2**30, 2**30 + config.statistics_batches)  # none of the run's own
-            single = Loader(self.builder, self.loader.plan, Pool(), 0.0, self.splits)  # single steps in any case
+            single: Loader[Any] = Loader(
+                self.builder, self.loader.plan, Pool(), 0.0, self.splits
+            )  # single steps in any case
             batches = (single.build(step, splits=config.splits, part=slice(None)) for step in steps)
-            self.network.set_statistics(statistics(batches, self.network))
+            measured = position_statistics if self.positions else statistics
+            self.network.set_statistics(measured(batches, self.network))
         group.agree("the step to resume from", self.step, SHARED_OUT)
         if not resumed:
             group.same(self.network.state_dict().values())
             self.average.update(self.network)
         self.log = RunLog(self.out if group.first else None, self.step if resumed else None)
         settings = (self.network, config.loss, config.noise.features, config.precision)
-        objective = UnrolledObjective(*settings, config.unroll) if config.unroll.steps > 1 else Objective(*settings)
+        objective: Objective | UnrolledObjective | PositionObjective
+        if self.positions:
+            objective = PositionObjective(self.network, config.outfit, config.precision)
+        else:
+            unrolled = config.unroll.steps > 1
+            objective = UnrolledObjective(*settings, config.unroll) if unrolled else Objective(*settings)
+        self.objective = objective
         self.names = (*objective.figures, "gradient_norm")
         self.recent = [row for row in self.recent if len(row) == len(self.names)]  # others are of another objective
         self.trainer = Trainer(objective, group, config.compile)
@@ -193,13 +207,15 @@ class Run:
             self.look_at_clock()
         bar.close()
 
-    def update(self, batch: Batch | UnrolledBatch) -> None:
+    def update(self, batch: Batch | UnrolledBatch | OutfitBatch) -> None:
         """One step of the optimiser; the host does not wait for the device."""
         config, network = self.config, self.network
         torch.manual_seed(config.seed * 1_000_003 + self.step + 2**40 * self.group.rank)  # dropout and feature noise
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(self.progress(self.step))
         self.optimizer.zero_grad(set_to_none=True)
+        if isinstance(self.objective, PositionObjective):
+            self.objective.progress = self.progress(self.step)
         losses = self.trainer.backward(batch)
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip, foreach=True)
         self.optimizer.step()

@@ -28,8 +28,10 @@ from warpgarment.io.disk.leftovers import remove_leftovers
 from warpgarment.io.disk.outputs import check_space, check_writable
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import architecture, build_network
+from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.distributed import Group, GroupError
 from warpgarment.training.samples.loader import Plan
+from warpgarment.training.samples.outfits import OutfitBuilder
 from warpgarment.training.samples.single_step import SampleBuilder
 
 from .config import TrainConfig
@@ -82,7 +84,7 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     try:
         sequences = load_sequences(config, network.config, skipped, group)
         validation = load_validation(config, skipped, network.config.fps) if group.first else []
-        builder = SampleBuilder(sequences, network.config, config.noise, config.augmentation)
+        builder = make_builder(config, network, sequences)
         sizes, counts = [len(s.faces) for s in sequences], [s.count - config.unroll.steps + 1 for s in sequences]
         plan = Plan(sizes, counts, config.batch_size, config.seed)
         run = Run(config, network, plan, builder, validation, began, group)
@@ -108,6 +110,26 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
     if group.first:
         say(f"step {run.step:,}: {best}" + (f", {spelt(run.figures)}" if run.figures else ""))
     return best
+
+
+def make_builder(config: TrainConfig, network: GarmentNetwork, sequences: list) -> SampleBuilder | OutfitBuilder:
+    """The builder of single-step samples, or of outfits for a network that predicts positions.
+
+    Raises:
+        ValueError: The network predicts positions, and its kind does not say so.
+    """
+    if architecture(network.config.architecture).positions:
+        less = config.outfit.noise
+        noise = dataclasses.replace(
+            config.noise, position=less * config.noise.position, offset=less * config.noise.offset
+        )
+        return OutfitBuilder(sequences, network, noise, config.outfit.rollout, config.unroll.steps)
+    if type(network).forward_normalised is GarmentNetwork.forward_normalised:
+        raise ValueError(
+            f"a {type(network).__name__} has no forward_normalised, so it is not trained on steps of faces. If it "
+            f"predicts positions, set positions = True in its Architecture ({network.config.architecture!r})"
+        )
+    return SampleBuilder(sequences, network.config, config.noise, config.augmentation)
 
 
 def _prepare(config: TrainConfig) -> None:

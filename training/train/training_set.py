@@ -11,12 +11,14 @@ import torch
 from tqdm import tqdm
 
 from warpgarment.errors import MeshError
+from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.objects.body import BodyMotion
 from warpgarment.training.data.sequence import Sequence, list_sequences, read_manifest
 from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import check_rate
 from warpgarment.training.samples.interactions import cached, default_cache
+from warpgarment.training.samples.outfits import OutfitData
 from warpgarment.training.samples.recorded import SequenceData
 
 from .config import TrainConfig
@@ -30,8 +32,9 @@ class NoTrainingData(ValueError):
 
 def load_sequences(
     config: TrainConfig, network: NetworkConfig, skipped: dict[str, str], group: Group
-) -> list[SequenceData]:
-    """Loads the training sequences with their cached interactions; adds unusable ones and the reasons to `skipped`.
+) -> list[SequenceData] | list[OutfitData]:
+    """Loads the training sequences, with their cached interactions if the network reads features of faces; adds
+    unusable ones and the reasons to `skipped`.
 
     Raises:
         NoTrainingData: No sequence can be used.
@@ -39,19 +42,24 @@ def load_sequences(
     """
     cache = Path(config.cache) if config.cache else default_cache(Path(config.data))
     folders = folders_of(Path(config.data), "train", skipped)[: config.max_sequences]
-    if group.size > 1:  # each process fills a share of the cache, then all read it
+    positions = architecture(network.architecture).positions
+    if group.size > 1 and not positions:  # each process fills a share of the cache, then all read it
         for folder in _watched(folders[group.rank :: group.size], group):
             try:
                 cached(Sequence.load(folder), folder, cache, group.device)
             except Exception as error:
                 reason_of(error)
         group.wait()
-    sequences = []
+    sequences: list = []
     for folder in _watched(folders, group):
         try:
-            sequence = Sequence.load(folder)
-            check_rate(sequence.fps, network.fps)
-            sequences.append(SequenceData(sequence, folder, cache, network, group.device))
+            loaded = Sequence.load(folder)
+            check_rate(loaded.fps, network.fps)
+            sequences.append(
+                OutfitData(loaded, folder, network, group.device)
+                if positions
+                else SequenceData(loaded, folder, cache, network, group.device)
+            )
         except Exception as error:
             skipped[folder.name] = reason_of(error)
     names = "\n".join(f"{s.name} {len(s.faces)} {s.count}" for s in sequences)

@@ -20,7 +20,11 @@ if TYPE_CHECKING:
     from .inputs import NetworkSizes
     from .network import GarmentNetwork
 
-ARCHITECTURES = {"faces": "warpgarment.nn.faces", "patches": "warpgarment.nn.patches"}
+ARCHITECTURES = {
+    "faces": "warpgarment.nn.faces",
+    "patches": "warpgarment.nn.patches",
+    "layers": "warpgarment.nn.layers",
+}
 """Module of each value of `NetworkConfig.architecture`; every such module has an object `ARCHITECTURE`."""
 
 
@@ -36,11 +40,14 @@ class Architecture(Protocol):
         presets: Named settings, which `TrainConfig.network` can choose.
         subsets: Whether a network may be run on some of a garment's faces. If not, a simulation always gives it all
             faces, whatever `face_splits` is, and training does so once garments are no longer split.
+        positions: Whether networks of this kind answer with a `VertexStep`. They are trained on positions of whole
+            outfits, and read no features of faces then.
     """
 
     config: type[NetworkConfig]
     presets: Mapping[str, NetworkConfig]
     subsets: bool
+    positions: bool = False
 
     def build(self, config: NetworkConfig) -> GarmentNetwork:
         """An untrained network."""
@@ -87,6 +94,10 @@ class Architecture(Protocol):
         of other stages, counts. All other entries last for the whole simulation and are added up.
         """
         ...
+
+    def patch_means(self, layout: Any, positions: torch.Tensor) -> torch.Tensor:
+        """The means that `VertexStep.patches` predicts, of positions [V,3]; only for kinds that predict them."""
+        raise TypeError(f"{type(self).__name__} predicts no patches")
 
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: Any) -> tuple[int, int]:
         """Number of operations of the forward pass for one row, see flops.py.

@@ -20,6 +20,9 @@ LARGEST = {  # largest values of integer settings; the paper's network has 512, 
     "face_embedding": 16_384,
     "face_feed_forward": 65_536,
     "face_layers": 512,
+    "decoder": 65_536,
+    "world_heads": 512,
+    "patch_neighbours": 4_096,
 }
 LARGEST_OTHER = 1_000_000_000  # largest value of any other number
 

@@ -22,9 +22,9 @@ from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
 
 from . import hub, shards
-from .architecture import ARCHITECTURES, architecture, build_network
+from .architecture import ARCHITECTURES, architecture, build_network, check_name
 from .bounds import check_settings, checked_json
-from .config import STATISTICS, NetworkConfig
+from .config import NetworkConfig
 from .device import device_of
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def save(
         raise ValueError(f"dtype must be one of {', '.join(str(d)[6:] for d in _DTYPES)}, got {str(dtype)[6:]}")
     tensors = {}
     for name, tensor in network.state_dict().items():
-        tensor = tensor.detach().to("cpu", torch.float32 if name in STATISTICS else dtype).contiguous()
+        tensor = tensor.detach().to("cpu", torch.float32 if name in network.statistics else dtype).contiguous()
         if not torch.isfinite(tensor).all():
             raise CheckpointError(f"{name} is not finite in {str(dtype)[6:]}; nothing was written to {path}")
         tensors[name] = tensor
@@ -126,7 +126,7 @@ def load(path: str | os.PathLike[str], *, device: torch.device | str | None = No
             raise CheckpointError(f"{path}: {name} is {str(tensor.dtype)[6:]}, expected a floating-point tensor")
         if not torch.isfinite(tensor).all():
             raise CheckpointError(f"{path}: {name} is not finite; the network was saved after training had diverged")
-        if name.endswith("_std") and name in STATISTICS and (tensor <= 0).any():
+        if name.endswith("_std") and name in network.statistics and (tensor <= 0).any():
             raise CheckpointError(f"{path}: {name} must be positive, smallest is {tensor.min().item():g}")
     network.load_state_dict(tensors)
     return network.to(device or "cpu").eval()
@@ -228,6 +228,11 @@ def _json_object(path: object, key: str, metadata: Mapping[str, str]) -> dict[st
 
 def _config(path: object, settings: dict[str, Any]) -> NetworkConfig:
     name = settings.get("architecture")
+    if isinstance(name, str):
+        try:
+            check_name(name)
+        except ValueError as error:
+            raise CheckpointError(f"{path}: {error}") from None
     described = architecture(name).config if isinstance(name, str) and name in ARCHITECTURES else NetworkConfig
     fields = {field.name: field for field in dataclasses.fields(described)}
     unknown = sorted(settings.keys() - fields.keys())

@@ -9,12 +9,14 @@ import torch
 
 if TYPE_CHECKING:
     from warpgarment.objects.garment import Garment
+    from warpgarment.objects.pack import PackedBodies
 
 
 class FrameInputs(NamedTuple):
     """A packed batch of F faces, V vertices and C connected components at frame t, in physical units and world space.
 
-    The last four are None unless the network `reads` them.
+    `previous`, `previous_body`, `materials`, `wind` and `pairs` are None unless the network `reads` them; it gets
+    `previous_body` with `previous`. `materials` and `wind` may be None all the same.
     """
 
     features: torch.Tensor  # [F,H,K] oldest first, all channels of kernels/features/channels.py
@@ -22,16 +24,19 @@ class FrameInputs(NamedTuple):
     vertices: torch.Tensor  # [V,3] frame t [m]
     body: torch.Tensor  # [U,3] frame t [m]
     next_body: torch.Tensor  # [U,3] frame t+1 [m]
-    previous: torch.Tensor | None = None  # [V,3] frame t-1 [m]
-    materials: torch.Tensor | None = None  # [B,M] the fields of `Material`, in their order
-    wind: torch.Tensor | None = None  # [B,3] velocity of the air [m/s]
+    previous: torch.Tensor | None = None  # [2,V,3] frames t-1 and t-2 [m]
+    previous_body: torch.Tensor | None = None  # [2,U,3] frames t-1 and t-2 [m]
+    materials: torch.Tensor | None = None  # [B,M] the fields of `Material`, in their order; NaN where there is none
+    wind: torch.Tensor | None = None  # [2,B,3] velocity of the air at t+1 and t [m/s]
     pairs: torch.Tensor | None = None  # int32 [P,2] vertices of different garments that are near each other
+    bodies: PackedBodies | None = None  # topology of the bodies, and which garment is on which
 
 
 class VertexStep(NamedTuple):
     """Output of a network that predicts positions of vertices; `parametrisation.Step` is the output per face."""
 
     positions: torch.Tensor  # [V,3] the next frame before contact [m]; no Poisson system is solved
+    patches: torch.Tensor | None = None  # [P,3] means over patches of the cloth, which only training uses [m]
 
 
 class RowInputs(NamedTuple):
@@ -63,3 +68,4 @@ class NetworkSizes(NamedTuple):
     face_splits: int = 1
     half: bool = False  # whether the network runs in bfloat16
     cpu: bool = True  # whether the device is a CPU
+    body_vertices: int = 0  # number of vertices of all bodies

@@ -39,9 +39,11 @@ class GarmentNetwork(nn.Module):
     Attributes:
         reads: Names of the optional fields of `FrameInputs` that `predict` needs: `previous`, `materials`, `wind`,
             `pairs`.
+        statistics: Buffers of the normalisation and their lengths.
     """
 
     reads: ClassVar[frozenset[str]] = frozenset()
+    statistics: ClassVar[Mapping[str, int]] = STATISTICS
 
     face_head: nn.Linear
     velocity_head: nn.Linear
@@ -60,12 +62,13 @@ class GarmentNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.channels = FACE.only(config.channels)
-        for name, length in STATISTICS.items():
+        for name, length in self.statistics.items():
             length = self.channels.width if name.startswith("feature_") else length
             start = torch.zeros(length) if name.endswith("_mean") else torch.ones(length)
             self.register_buffer(name, start)
-        self.psi_mean.copy_(torch.eye(3).flatten())
-        self.singular_value_mean.fill_(1.0)
+        if "psi_mean" in self.statistics:
+            self.psi_mean.copy_(torch.eye(3).flatten())
+            self.singular_value_mean.fill_(1.0)
 
     def encoder_layers(self) -> nn.ModuleList:
         """Untrained encoder layers on tokens of width `config.embedding`."""
@@ -144,6 +147,19 @@ class GarmentNetwork(nn.Module):
             view.add_to(output, run(self, view.inputs(features, velocities), bfloat16=bfloat16).output)
         newest = context(features, layout.face_component, components)
         return compose(output, newest, residual=self.config.residual)
+
+    def observed(self, inputs: FrameInputs, layout: Any, after: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Numbers of which `statistics` holds the mean and deviation, for a network that predicts positions.
+
+        Args:
+            inputs: The batch at frame t.
+            layout: The result of `layout`.
+            after: Positions at t+1 [m], shape [V,3].
+
+        Returns:
+            Rows [*,K] by name, without "_mean" and "_std"; none, as here, if the network has no such statistics.
+        """
+        return {}
 
     def encode(self, face_features: torch.Tensor) -> torch.Tensor:
         """Normalises features in the network's frame; the same statistics serve all frames of the history."""
@@ -227,16 +243,16 @@ class GarmentNetwork(nn.Module):
         """Replaces statistics of the normalisation.
 
         Args:
-            statistics: Values by name, any of `STATISTICS` and of the length given there. They describe inputs in the
-                canonical frame, and targets from `parametrisation.targets` in the canonical frame.
+            statistics: Values by name, any of the attribute `statistics` and of the length given there. They describe
+                inputs in the canonical frame, and targets from `parametrisation.targets` in the canonical frame.
 
         Raises:
             ValueError: An unknown name, a wrong length, a value that is not finite, a deviation that is not positive,
                 or an output mean of a residual network that is not "moves like skin".
         """
         for name, value in statistics.items():
-            if name not in STATISTICS:
-                raise ValueError(f"unknown statistic {name!r}; there are {', '.join(STATISTICS)}")
+            if name not in self.statistics:
+                raise ValueError(f"unknown statistic {name!r}; there are {', '.join(self.statistics)}")
             value = torch.as_tensor(value, dtype=torch.float32)
             length = len(getattr(self, name))
             if tuple(value.shape) != (length,):

@@ -89,6 +89,7 @@ class PackedBodies:
     vertex_offsets: tuple[int, ...]
     face_offsets: tuple[int, ...]
     body_of_garment: torch.Tensor  # int32 [B]
+    body_of_vertex: torch.Tensor  # int32 [U]
 
     @classmethod
     def pack(
@@ -113,6 +114,7 @@ class PackedBodies:
             vertex_offsets=offsets,
             face_offsets=_offsets([len(f) for f in faces]),
             body_of_garment=torch.tensor(list(body_of_garment), dtype=torch.int32, device=device),
+            body_of_vertex=_owner(offsets, device),
         )
 
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import torch
 
-from warpgarment.nn.inputs import FrameInputs
-
-from .frame import Frame
+from .frame import Frame, earlier
 from .scene import Scene
 
 
 def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
-    """Computes frame t+1 from frame t and the bodies at t+1 [m], shape [U,3]. The host does not wait for a GPU."""
+    """Computes frame t+1 from frame t and the bodies at t+1 [m], shape [U,3]. The host does not wait for a GPU.
+
+    The wind of `now` must be that of t+1 and t (`Frame.blown`), and is that of the result.
+    """
     before = now.positions
     features = scene.features(before, now.body, next_body)
     stacked = now.history.stacked(features)
-    step = scene.predict(FrameInputs(stacked, now.velocities, before, now.body, next_body))
+    step = scene.predict(scene.inputs(now, stacked, next_body))
     solved, finite = scene.reconstruct(before, step, features, next_body)
     origin = scene.contact.origin(before, features)
     meets = scene.meet.on
@@ -26,4 +27,16 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     after, finite, depth = scene.correct(before, pushed, next_body, finite, depth)
     history = now.history.followed(stacked, scene.centroids(after) - scene.centroids(before))
     solves = torch.stack([scene.reconstruct.summary(), report])
-    return Frame(after, next_body, history.features, history.velocities, finite, depth, solves, meeting)
+    return Frame(
+        after,
+        next_body,
+        history.features,
+        history.velocities,
+        finite,
+        depth,
+        solves,
+        meeting,
+        earlier(now.previous, before),
+        earlier(now.previous_body, now.body),
+        now.wind,
+    )

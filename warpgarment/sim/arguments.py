@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from warpgarment.errors import MeshError
+from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 
 
@@ -148,3 +149,28 @@ def counted(frames: range, progress: bool) -> Any:
     from tqdm import tqdm
 
     return tqdm(frames, desc="rollout", unit="frame")
+
+
+def given_bodies(vertices: Any, faces: Any, count: int, fps: float) -> tuple[list[BodyMotion], list[int]]:
+    """Bodies of one frame, and the number of the body of each garment.
+
+    Args:
+        vertices: Positions [m], shape [U,3], of one body for all garments; or a list with one for each.
+        faces: Vertex indices, shape [G,3]; a list if `vertices` is one.
+        count: Number of garments.
+        fps: Frames per second.
+
+    Raises:
+        ValueError: Lists of other lengths.
+        MeshError: The arrays are no body.
+    """
+    if isinstance(vertices, (list, tuple)):
+        if len(vertices) != count or len(faces) != count:
+            raise ValueError(
+                f"{count} garments, {len(vertices)} bodies and {len(faces)} arrays of body faces; give one of each per "
+                "garment, or one body for all"
+            )
+        on = list(range(count))
+    else:
+        vertices, faces, on = [vertices], [faces], [0] * count
+    return [BodyMotion(as_array(v)[None], f, fps) for v, f in zip(vertices, faces, strict=True)], on

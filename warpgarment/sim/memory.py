@@ -92,7 +92,7 @@ def predict(
     sizes = Sizes.of(garments, bodies)
     _, vertices, faces, body_vertices, body_faces = sizes
 
-    shown = NetworkSizes(garments, face_splits, half, cpu)
+    shown = NetworkSizes(garments, face_splits, half, cpu, body_vertices)
     network = dict(architecture(config.architecture).memory(shown, config))
     blocks, scratch, inverted = _compliance(garments)
     passing = {

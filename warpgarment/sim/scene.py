@@ -32,9 +32,11 @@ from warpgarment.sim.stages.reconstruct import Reconstruct
 from . import memory
 from .bodies import MovingBodies
 from .brought import Brought
+from .frame import Frame
 from .surface import Surface
 from .timing import Timings
 
+GIVEN = frozenset({"previous", "materials", "wind"})  # optional inputs of networks that simulations have
 FARTHEST = 1.0  # metres; a garment whose nearest vertex is farther from its body has a wrong position or unit
 
 
@@ -56,6 +58,8 @@ class Scene:
         correctors: What changes positions after contact.
         brought: What users brought, where it is more than `garments`.
         layers: Garments of each outfit, innermost first, as numbers in the batch; see `arguments.outfits`.
+        materials: Material of each garment, with the fields of `Material`, shape [B,M]; NaN for a garment without one.
+            None if no garment has one.
 
     Attributes:
         contact_sources: List of contact sources; more may be appended before the first frame.
@@ -84,9 +88,12 @@ class Scene:
         correctors: Sequence[Corrector] = (),
         brought: Brought | None = None,
         layers: Sequence[Sequence[int]] = (),
+        materials: torch.Tensor | None = None,
     ) -> None:
-        if network.reads:
-            raise ValueError(f"the network reads {', '.join(sorted(network.reads))}, which simulations do not give yet")
+        if missing := network.reads - GIVEN:
+            raise ValueError(f"the network reads {', '.join(sorted(missing))}, which simulations do not give yet")
+        self.packed_bodies = bodies
+        self.materials = materials if "materials" in network.reads else None
         device = body_vertices.device
         self.garments, self.network, self.timings, self.half = list(garments), network, timings, half
         self.contact_sources, self.correctors = list(contact_sources), list(correctors)
@@ -148,6 +155,28 @@ class Scene:
                     "metres (Garment.load(..., unit=...)) and Y up, and bring the garment onto the first frame with "
                     "wg.fit."
                 )
+
+    def inputs(self, now: Frame, features: torch.Tensor, next_body: torch.Tensor) -> FrameInputs:
+        """What the network gets of a frame.
+
+        Args:
+            now: The frame t.
+            features: Features of the history with frame t, shape [F,H,34].
+            next_body: Bodies at t+1 [m], shape [U,3].
+        """
+        past = "previous" in self.network.reads
+        return FrameInputs(
+            features,
+            now.velocities,
+            now.positions,
+            now.body,
+            next_body,
+            previous=now.previous if past else None,
+            previous_body=now.previous_body if past else None,
+            materials=self.materials,
+            wind=now.wind if "wind" in self.network.reads else None,
+            bodies=self.packed_bodies,
+        )
 
     def predict(self, inputs: FrameInputs) -> Step | VertexStep:
         """Step 2 of a frame: the network predicts the step to t+1."""

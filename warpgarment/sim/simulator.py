@@ -7,7 +7,6 @@ batch; one garment is a batch of one.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from typing import Any, overload
 
@@ -29,15 +28,14 @@ from warpgarment.objects.status import RolloutStatus
 from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
-from .arguments import Layers, as_array, counted, known_frames, listed, outfits, per_garment
+from .arguments import Layers, as_array, counted, given_bodies, known_frames, listed, outfits, per_garment
 from .brought import Brought
-from .frame import Frame
 from .graph import GraphedFrames
-from .history import History
+from .outdoors import Materials, as_materials, as_wind
 from .results.recording import READ_EVERY, Recording, seen
 from .results.shot import Rate, bodies_of_shot, brought_to_shot, frames_needed, rates_of
 from .scene import Scene
-from .state import SimulationState, Status, Vertices
+from .state import SimulationState, Status, Vertices, starting_states
 from .timing import Timings
 
 
@@ -116,6 +114,8 @@ class Simulator:
         face_splits: int = 1,
         layers: Layers = None,
         progress: bool = False,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> GarmentMotion: ...
 
     @overload
@@ -131,6 +131,8 @@ class Simulator:
         face_splits: int = 1,
         layers: Layers = None,
         progress: bool = False,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> list[GarmentMotion]: ...
 
     def rollout(
@@ -145,6 +147,8 @@ class Simulator:
         face_splits: int = 1,
         layers: Layers = None,
         progress: bool = False,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> GarmentMotion | list[GarmentMotion]:
         """Simulates garments over motions of their bodies, as one batch.
 
@@ -175,13 +179,17 @@ class Simulator:
                 in the order of the list, innermost first; a single garment is kept from crossing itself. Or a list of
                 outfits, each a list of numbers of garments, innermost first, such as `[[0, 1], [2, 3, 4]]`.
             progress: Whether to show a progress bar.
+            materials: Material of all garments, or a list with one, or None, for each; for networks that read them.
+            wind: Velocity of the air [m/s], shape [3], [T,3] or [T,B,3], at the network's rate; the last row holds on.
+                For networks that read it.
 
         Returns:
             A `GarmentMotion`, or a list of them for a list of garments.
 
         Raises:
             ValueError: Lists have different lengths, arrays have other shapes, both `first_vertices` and `history`
-                are given, or `layers` name a garment that does not exist, twice, or on another body.
+                are given, `layers` name a garment that does not exist, twice, or on another body, or `materials` or
+                `wind` are given for a network that does not read them.
             MeshError: A garment is more than 1 m from its body, or positions are not finite.
             NotEnoughMemory: The batch would not fit on the device; the message names settings with which it would.
             UsageError: `frames` is less than 1.
@@ -207,33 +215,24 @@ class Simulator:
         def body_at(frame: int) -> torch.Tensor:
             return self._positions([m.vertices[min(frame, m.frames - 1)] for m in motions])
 
-        packed = PackedBodies.pack(
-            [m.faces for m in motions],
-            [m.vertices.shape[1] for m in motions],
-            on,
-            self.device,
-        )
+        sizes = [m.vertices.shape[1] for m in motions]
+        packed = PackedBodies.pack([m.faces for m in motions], sizes, on, self.device)
         first = [body_at(frame) for frame in range(given)]
-        states = self._begin(brought, single, packed, first, face_splits, outfits(layers, on))
+        known_materials = as_materials(materials, len(garments), self.network, self.device)
+        blown = as_wind(wind, len(garments), self.network)
+        blowing = [self._air(blown, frame) for frame in range(given)]
+        worn = outfits(layers, on)
+        states = self._begin(brought, single, packed, first, face_splits, worn, known_materials, blowing)
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         with evaluating(self.network):
             for frame in counted(range(total), progress):
-                state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
+                known = frame < given
+                state = states[frame] if known else self._advance(state, body_at(frame), self._air(blown, frame))
                 if not recording.add(seen(state.scene, state.now), last=frame == total - 1):
                     break
-        results = []
-        for i, (worn, statuses) in enumerate(zip(garments, recording.statuses, strict=True)):
-            if not statuses[-1].finite:
-                label = worn.name or f"garment {i}"
-                warnings.warn(f"{label} stopped: {statuses[-1].message}", RuntimeWarning, stacklevel=2)
-            moved = recording.positions[i][: len(statuses)]
-            if history is not None:
-                moved[:given] = brought.given[i]
-            clock = motions[on[i]].clock
-            last = clock.last if len(moved) == clock.frames else None
-            told: dict[str, Any] = {"start": clock.start, "last": last, "surface": worn.surface}
-            results.append(GarmentMotion(moved, worn.faces, fps, statuses, worn.name, **told))
+        returned = brought.given if history is not None else None
+        results = recording.motions(garments, [motions[i].clock for i in on], fps, returned)
         if shot is not None:
             results = brought_to_shot(states[0].scene, results, on, shot, motions, rates, frames)
         return results[0] if single else results
@@ -248,6 +247,8 @@ class Simulator:
         first_vertices: Any = None,
         face_splits: int = 1,
         layers: Layers = None,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> SimulationState[np.ndarray, RolloutStatus]: ...
 
     @overload
@@ -260,6 +261,8 @@ class Simulator:
         first_vertices: Any = None,
         face_splits: int = 1,
         layers: Layers = None,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> SimulationState[list[np.ndarray], list[RolloutStatus]]: ...
 
     def start(
@@ -271,6 +274,8 @@ class Simulator:
         first_vertices: Any = None,
         face_splits: int = 1,
         layers: Layers = None,
+        materials: Materials = None,
+        wind: Any = None,
     ) -> SimulationState[Any, Any]:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
@@ -281,6 +286,8 @@ class Simulator:
             first_vertices: Positions in the first frame, as in `rollout`.
             face_splits: Number of subsets of the faces, as in `rollout`.
             layers: Which garments are worn together, as in `rollout`.
+            materials: Materials, as in `rollout`.
+            wind: Velocity of the air in the first frame [m/s], shape [3], or [1,B,3] with one for each garment.
 
         Returns:
             The state at frame 0.
@@ -289,31 +296,23 @@ class Simulator:
             ValueError, MeshError, NotEnoughMemory: As for `rollout`.
         """
         garments, single = listed(garment, Garment)
-        if isinstance(body_vertices, (list, tuple)):
-            if len(body_vertices) != len(garments) or len(body_faces) != len(garments):
-                raise ValueError(
-                    f"{len(garments)} garments, {len(body_vertices)} bodies and {len(body_faces)} arrays of body "
-                    "faces; give one of each per garment, or one body for all"
-                )
-            shapes, faces, on = list(body_vertices), list(body_faces), list(range(len(garments)))
-        else:
-            shapes, faces, on = [body_vertices], [body_faces], [0] * len(garments)
-        checked = [
-            BodyMotion(as_array(v)[None], f, self.network.config.fps) for v, f in zip(shapes, faces, strict=True)
-        ]
+        checked, on = given_bodies(body_vertices, body_faces, len(garments), self.network.config.fps)
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
         brought = self._brought(garments, single, first_vertices, None)
         first = self._positions([b.vertices[0] for b in checked])
-        return self._begin(brought, single, packed, [first], face_splits, outfits(layers, on))[0]
+        known_materials = as_materials(materials, len(garments), self.network, self.device)
+        worn, blown = outfits(layers, on), as_wind(wind, len(garments), self.network, one=True)
+        return self._begin(brought, single, packed, [first], face_splits, worn, known_materials, [self._air(blown)])[0]
 
     def step(
-        self, state: SimulationState[Vertices, Status], next_body_vertices: Any
+        self, state: SimulationState[Vertices, Status], next_body_vertices: Any, *, wind: Any = None
     ) -> SimulationState[Vertices, Status]:
         """Simulates the next frame.
 
         Args:
             state: A state from `start` or `step`; it is not changed.
             next_body_vertices: Body in the next frame [m], shape [U,3]; a list if `start` was given one. It is copied.
+            wind: Velocity of the air in the next frame [m/s], as in `start`; None leaves it as it is.
 
         Returns:
             The next state. A garment that is not finite stays so, and its vertices are NaN.
@@ -330,7 +329,8 @@ class Simulator:
         if not all(np.isfinite(array).all() for array in arrays):
             raise MeshError(f"body_vertices of frame {state.frame + 1} hold NaN or infinity; skip or repair the frame")
         with evaluating(self.network):
-            return self._advance(state, body)
+            air = as_wind(wind, len(state.scene.garments), self.network, one=True)
+            return self._advance(state, body, self._air(air))
 
     @torch.inference_mode()
     def _begin(
@@ -341,8 +341,17 @@ class Simulator:
         body_frames: list[torch.Tensor],
         face_splits: int,
         layers: list[list[int]],
+        materials: torch.Tensor | None,
+        wind: Sequence[torch.Tensor | None],
     ) -> list[SimulationState[Any, Any]]:
-        """States of the known frames: one for a cold start, H with a history."""
+        """States of the known frames: one for a cold start, H with a history.
+
+        Args:
+            brought, single, bodies, body_frames, face_splits: As in `rollout`, packed.
+            layers: The result of `outfits`.
+            materials: The result of `as_materials`.
+            wind: As in `starting_states`.
+        """
         garments, known = brought.simulated, torch.from_numpy(brought.known).to(self.device)
         scene = Scene(
             garments,
@@ -359,38 +368,27 @@ class Simulator:
             correctors=self.correctors,
             brought=brought,
             layers=layers,
+            materials=materials,
         )
-        history_length = self.network.config.history
-        features = scene.features(known[0], body_frames[0], body_frames[0])
-        history = History.cold(features, scene.packed.component_count, history_length)
-        graph = GraphedFrames(scene) if self.graph else None
-        finite = torch.ones(len(garments), dtype=torch.bool, device=self.device)
-        unsolved = torch.zeros((2, 3), dtype=torch.float64, device=self.device)
-        states: list[SimulationState[Any, Any]] = []
-        for frame, (vertices, body) in enumerate(zip(known, body_frames, strict=True)):
-            if frame:
-                features = scene.features(known[frame - 1], body_frames[frame - 1], body)
-                velocity = scene.centroids(vertices) - scene.centroids(known[frame - 1])
-                history = history.followed(history.stacked(features), velocity)
-            depth = scene.contact.depth(vertices, body)
-            met = scene.meet.measure(vertices, finite)
-            now = Frame(vertices, body, history.features, history.velocities, finite, depth, unsolved, met)
-            states.append(SimulationState(scene, single, frame, now, graph))
-        return states
+        return starting_states(scene, single, known, body_frames, wind, GraphedFrames(scene) if self.graph else None)
 
     @torch.inference_mode()
     def _advance(
-        self, state: SimulationState[Vertices, Status], next_body: torch.Tensor
+        self, state: SimulationState[Vertices, Status], next_body: torch.Tensor, wind: torch.Tensor | None
     ) -> SimulationState[Vertices, Status]:
-        scene = state.scene
+        scene, now = state.scene, state.now.blown(wind)
         if state.graph is None or self.timings.synchronise:
-            after = advance(scene, state.now, next_body)
+            after = advance(scene, now, next_body)
         else:
-            after = state.graph(state.now, next_body)
+            after = state.graph(now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
 
     def _brought(self, garments: list[Garment], single: bool, first: Any, history: Any) -> Brought:
         return Brought(garments, known_frames(garments, single, first, history, self.network.config.history))
+
+    def _air(self, wind: np.ndarray | None, frame: int = 0) -> torch.Tensor | None:
+        """A frame of the result of `as_wind`, [B,3]; the last one holds on."""
+        return None if wind is None else self._positions(list(wind[[min(frame, len(wind) - 1)]]))
 
     def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
         """Concatenates arrays [*,3] on the device; always a copy, so that callers may reuse their arrays.

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
+import torch
+
 from .frame import Frame
 from .graph import GraphedFrames
+from .history import History
 from .results.recording import Outcome, read, seen
 from .scene import Scene
 
@@ -50,3 +54,58 @@ class SimulationState(Generic[Vertices, Status]):
     @cached_property
     def _read(self) -> Outcome:
         return read(self.scene, self.frame, [seen(self.scene, self.now)])[0]
+
+
+def starting_states(
+    scene: Scene,
+    single: bool,
+    known: torch.Tensor,
+    bodies: Sequence[torch.Tensor],
+    wind: Sequence[torch.Tensor | None],
+    graph: GraphedFrames | None,
+) -> list[SimulationState[Any, Any]]:
+    """States of the known frames: one for a cold start, as many as the network's history otherwise.
+
+    Args:
+        scene: The scene.
+        single: Whether one garment was given instead of a list.
+        known: Garments in the known frames [m], packed, shape [K,V,3].
+        bodies: Bodies in these frames [m], packed, shape [U,3] each.
+        wind: Velocity of the air in these frames [m/s], shape [B,3] each; None for still air.
+        graph: What replays later frames.
+    """
+    reads, count = scene.network.reads, scene.packed.count
+    features = scene.features(known[0], bodies[0], bodies[0])
+    history = History.cold(features, scene.packed.component_count, scene.network.config.history)
+    finite = torch.ones(count, dtype=torch.bool, device=known.device)
+    unsolved = torch.zeros((2, 3), dtype=torch.float64, device=known.device)
+    air = [known.new_zeros((count, 3)) if blowing is None else blowing for blowing in wind]
+    states: list[SimulationState[Any, Any]] = []
+    for frame, (vertices, body) in enumerate(zip(known, bodies, strict=True)):
+        if frame:
+            features = scene.features(known[frame - 1], bodies[frame - 1], body)
+            velocity = scene.centroids(vertices) - scene.centroids(known[frame - 1])
+            history = history.followed(history.stacked(features), velocity)
+        depth = scene.contact.depth(vertices, body)
+        past = [max(frame - k, 0) for k in (1, 2)] if "previous" in reads else []
+        blown = [air[frame], air[max(frame - 1, 0)]] if "wind" in reads else []
+        now = Frame(
+            vertices,
+            body,
+            history.features,
+            history.velocities,
+            finite,
+            depth,
+            unsolved,
+            scene.meet.measure(vertices, finite),
+            previous=_stacked([known[k] for k in past], vertices),
+            previous_body=_stacked([bodies[k] for k in past], body),
+            wind=_stacked(blown, air[0]),
+        )
+        states.append(SimulationState(scene, single, frame, now, graph))
+    return states
+
+
+def _stacked(frames: list[torch.Tensor], like: torch.Tensor) -> torch.Tensor:
+    """Frames [*,3] as [K,*,3]; of no frames [0,*,3]."""
+    return torch.stack(frames) if frames else like.new_empty((0, *like.shape))

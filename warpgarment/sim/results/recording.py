@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from warpgarment.objects.clock import Clock
+from warpgarment.objects.garment import Garment
+from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.status import RolloutStatus
 from warpgarment.sim.frame import Frame
 from warpgarment.sim.scene import Scene
@@ -111,3 +115,27 @@ class Recording:
             if not frame.alive:
                 return False
         return True
+
+    def motions(
+        self, garments: Sequence[Garment], clocks: Sequence[Clock], fps: float, given: Sequence[np.ndarray] | None
+    ) -> list[GarmentMotion]:
+        """The motion of each garment, with a warning for those that stopped.
+
+        Args:
+            garments: The garments as users brought them.
+            clocks: Times of the bodies' frames, for each garment.
+            fps: Frames per second of the rollout.
+            given: Known first frames of each garment, [K,V,3], which are returned as they are; None: none.
+        """
+        results = []
+        for i, (garment, clock, statuses) in enumerate(zip(garments, clocks, self.statuses, strict=True)):
+            if not statuses[-1].finite:
+                label = garment.name or f"garment {i}"
+                warnings.warn(f"{label} stopped: {statuses[-1].message}", RuntimeWarning, stacklevel=3)
+            moved = self.positions[i][: len(statuses)]
+            if given is not None:
+                moved[: len(given[i])] = given[i]
+            last = clock.last if len(moved) == clock.frames else None
+            told: dict[str, Any] = {"start": clock.start, "last": last, "surface": garment.surface}
+            results.append(GarmentMotion(moved, garment.faces, fps, statuses, garment.name, **told))
+        return results

@@ -1,0 +1,400 @@
+"""Training of networks that predict positions: samples, losses, the rollouts before them, a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import types
+
+import igl
+import numpy as np
+import pytest
+import torch
+from support import sequences
+from support.runs import config_for, entries_of
+
+from warpgarment.errors import MeshError
+from warpgarment.nn import checkpoint
+from warpgarment.nn.architecture import ARCHITECTURES, Architecture
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.inputs import VertexStep
+from warpgarment.nn.layers.config import LayersNetConfig
+from warpgarment.nn.layers.network import LayersNet
+from warpgarment.nn.network import GarmentNetwork
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.material import Material
+from warpgarment.sim.simulator import Simulator
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.rollouts import predict
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.outfits import OutfitBuilder, OutfitData
+from warpgarment.training.samples.statistics import position_statistics
+from warpgarment.training.train.config import TrainConfig
+from warpgarment.training.train.position_objective import PositionConfig, PositionObjective, vertex_normals
+from warpgarment.training.train.start import train
+from warpgarment.training.train.unrolled_objective import UnrollConfig
+
+CPU = torch.device("cpu")
+SMALL = {"embedding": 32, "layers": 1, "feed_forward": 32, "heads": 4, "world_heads": 2, "decoder": 32}
+SMALL |= {"patch_spacing": 0.1, "patch_radius": 0.1, "body_radius": 0.15}
+QUIET = NoiseConfig(position=0.0, offset=0.0)
+SHAPE = tuple(f"{name}={value}" for name, value in SMALL.items())
+
+
+def two_layers(content: dict) -> None:
+    """Makes an outfit of the tube and a wider one over it, in a wind."""
+    count = len(content["garment_rest_vertices"])
+    for name in ("garment_rest_vertices", "garment_vertices"):
+        inner = content[name]
+        middle = inner.mean(axis=-2, keepdims=True)
+        content[name] = np.concatenate([inner, middle + (inner - middle) * [1.2, 0.9, 1.2]], axis=-2).astype(np.float32)
+    faces = content["garment_faces"]
+    content["garment_faces"] = np.concatenate([faces, faces + count]).astype(np.int32)
+    content["garment_starts"] = np.array([0, count, 2 * count], np.int32)
+    frames = len(content["garment_vertices"])
+    content["wind"] = np.stack([np.linspace(0, 2, frames), np.zeros(frames), np.ones(frames)], 1).astype(np.float32)
+
+
+MATERIAL = Material(density=0.4, bend=1e-4)
+GARMENTS = [
+    {"name": "inner", "category": "tube", "material": MATERIAL.as_dict()},
+    {"name": "outer", "category": "tube", "material": None},
+]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Three sequences of two layers, and one for validation."""
+    root = tmp_path_factory.mktemp("layers")
+    for number, (name, split) in enumerate((("a", "train"), ("b", "train"), ("c", "train"), ("d", "validation"))):
+        extra = {"garments": GARMENTS}
+        sequences.write(root, name, split, seed=number, frames=16, spoil=two_layers, manifest=extra)
+    return root
+
+
+def network_of(**changes) -> LayersNet:
+    """A network with random weights and plausible statistics."""
+    torch.manual_seed(0)
+    network = LayersNet(LayersNetConfig(**(SMALL | {"residual": False} | changes)))
+    network.set_statistics({"acceleration_std": torch.full((3,), 2e-3)})
+    return network
+
+
+def builder_of(data, network, *, ahead=0, steps=1, noise=QUIET) -> OutfitBuilder:
+    """A builder for the sequences a and b."""
+    loaded = [OutfitData(Sequence.load(data / name), data / name, network.config, CPU) for name in "ab"]
+    return OutfitBuilder(loaded, network, noise, ahead, steps)
+
+
+def batch_of(data, network, picks=((0, 5), (1, 9)), **options):
+    """The batch of two samples."""
+    return builder_of(data, network, **options).build(list(picks), None, np.random.default_rng(0))
+
+
+def test_frames_of_a_batch(data):
+    """A sample would hold other frames, garments, materials or wind than its sequence. Exact."""
+    batch, network = batch_of(data, network_of(), ((0, 5), (1, 1)), ahead=2, steps=2), network_of()
+    assert batch.ahead == 2
+    parts = [Sequence.load(data / name) for name in "ab"]
+    count = len(parts[0].garment.vertices)
+    assert batch.packed.vertex_offsets == (0, count // 2, count, 3 * count // 2, 2 * count)
+    for k, (sequence, newest) in enumerate(zip(parts, (5, 1), strict=True)):
+        for i in range(7):
+            frame = max(newest - 4 + i, 0)  # a cold start repeats the first one
+            mine = batch.frames[i, k * count : (k + 1) * count]
+            np.testing.assert_array_equal(mine.numpy(), np.asarray(sequence.vertices[frame]))
+            body = batch.body[i].chunk(2)[k]
+            np.testing.assert_array_equal(body.numpy(), sequence.body().vertices[frame].astype(np.float32))
+            np.testing.assert_array_equal(batch.wind[i, 2 * k : 2 * k + 2].numpy(), [sequence.wind[frame]] * 2)
+    assert batch.materials[0].tolist() == pytest.approx(list(MATERIAL.as_dict().values()))
+    assert batch.materials[1].isnan().all()
+    inputs = batch.inputs(batch.recorded(4), 4, network.reads)
+    assert torch.equal(inputs.vertices, batch.frames[4])
+    assert torch.equal(inputs.previous, batch.frames[[3, 2]])
+    assert torch.equal(inputs.next_body, batch.body[5])
+    assert torch.equal(inputs.previous_body, batch.body[[3, 2]])
+    assert torch.equal(inputs.wind, batch.wind[[5, 4]])
+    assert inputs.bodies.body_of_garment.tolist() == [0, 0, 1, 1]
+
+
+def test_statistics(data):
+    """Inputs or outputs of the network would not have zero mean and unit variance. 1e-3."""
+    network = network_of()
+    batches = [batch_of(data, network, picks) for picks in (((0, 5), (1, 9)), ((0, 8), (1, 3)))]
+    found = position_statistics(batches, network)
+    network.set_statistics(found)
+    seen = [network.observed(b.inputs(b.recorded(2), 2, network.reads), b.layout, b.frames[3]) for b in batches]
+    for name in ("state", "acceleration"):
+        values = torch.cat([s[name] for s in seen])
+        scaled = (values - found[f"{name}_mean"]) / found[f"{name}_std"]
+        assert scaled.mean(dim=0).abs().max() < 1e-3
+        assert (scaled.std(dim=0) - 1).abs().max() < 1e-3 or (found[f"{name}_std"] <= 1.1e-3).any()
+
+
+class Told(LayersNet):
+    """Answers with given frames, whatever its inputs are, and keeps these."""
+
+    def told(self, frames):
+        self.frames, self.seen, self.modes = frames, [], []
+        return self
+
+    def predict(self, inputs, layout, *, bfloat16=False):
+        self.seen.append(inputs)
+        self.modes.append((self.training, torch.is_grad_enabled()))
+        after = self.frames[len(self.seen) - 1]
+        return VertexStep(after, layout.cloth.means(after))
+
+
+def told(frames) -> Told:
+    """A network that knows its answers."""
+    torch.manual_seed(0)
+    return Told(LayersNetConfig(**SMALL)).told(frames).train()
+
+
+def test_losses_of_known_frames(data):
+    """A term would be measured otherwise than it is described. 1e-5 of values near one, in float32."""
+    batch = batch_of(data, network_of())
+    offset = torch.tensor([0.03, 0.0, 0.04])  # 0.5 dm
+    objective = PositionObjective(told([batch.frames[3] + offset]), PositionConfig(body=0.0, layers=0.0), "float32")
+    losses = dict(zip(objective.figures, objective(batch).tolist(), strict=True))
+    assert losses["loss_position"] == pytest.approx(0.25, rel=1e-4)
+    assert losses["loss_patch"] == pytest.approx(0.25, rel=1e-4)
+    assert losses["loss_normal"] == pytest.approx(0.0, abs=1e-8)
+    assert losses["position_m"] == pytest.approx(0.05, rel=1e-4)
+    assert losses["loss"] == pytest.approx(0.5, rel=1e-4)
+    exact = PositionObjective(told([batch.frames[3]]), PositionConfig(), "float32")(batch)
+    assert exact[:4].abs().max() < 1e-9
+
+
+def test_normals_against_igl(data):
+    """Normals of another weighting would be compared. 1e-5, of unit vectors in float32."""
+    garment = Sequence.load(data / "a").garment
+    found = vertex_normals(torch.tensor(garment.vertices), torch.tensor(garment.faces))
+    expected = igl.per_vertex_normals(garment.vertices.astype(float), garment.faces.astype(np.int64), 1)
+    assert np.abs(found.numpy() - expected).max() < 1e-5
+
+
+def distances(points: torch.Tensor, body, frame: int) -> np.ndarray:
+    """Signed distances from a body in a frame by libigl [m]."""
+    mesh = body.vertices[frame].astype(float), body.faces.astype(np.int64)
+    where = points.numpy().astype(float)
+    inside = igl.fast_winding_number(*mesh, where) > 0.5
+    return np.sqrt(igl.point_mesh_squared_distance(where, *mesh)[0]) * np.where(inside, -1, 1)
+
+
+def test_collisions_with_the_body(data):
+    """Cloth in the body would not be pushed out, or cloth outside would. Against libigl, 1e-4 of the loss."""
+    batch = batch_of(data, network_of())
+    frame = batch.frames[3].clone()
+    count = len(frame) // 2
+    sequence = Sequence.load(data / "a")
+    body = sequence.body()
+    middle = torch.tensor(body.vertices[6].mean(axis=0), dtype=torch.float32)
+    frame[:7, [0, 2]] = middle[[0, 2]] + 0.3 * (frame[:7, [0, 2]] - middle[[0, 2]])
+    answer = frame.requires_grad_()
+    config = PositionConfig(position=0, patch=0, normal=0, layers=0, rollout=0)
+    objective = PositionObjective(told([answer]), config, "float32")
+    objective.progress = 1.0
+    losses = objective(batch)
+    losses[0].backward()
+    distance = distances(answer.detach()[:count], body, 6)
+    inside = np.flatnonzero(distance < 1e-4)
+    assert len(inside) == 7
+    assert losses[4].item() == pytest.approx(np.mean((10 * (1e-4 - distance[inside])) ** 2), rel=1e-4)
+    moved = answer.grad.norm(dim=1).nonzero()[:, 0].tolist()
+    assert moved == inside.tolist()
+    step = answer.detach() - 1e-3 * answer.grad / answer.grad.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    after = distances(step[:count], body, 6)
+    assert (after[inside] - distance[inside]).min() > 0.9e-3  # straight out
+
+
+def test_collisions_between_layers(data):
+    """The outer garment would not be kept outside the inner one, or the inner one would be moved, or the garment of the
+    next body be kept out of the last one of this."""
+    batch = batch_of(data, network_of())
+    frame = batch.frames[3].clone()
+    count = len(frame) // 4  # of a garment
+    chosen = count + torch.arange(14, 20)  # of the outer one, moved to 4 mm within the inner one
+    inner = frame[14:20]
+    middle = frame[:count].mean(dim=0)
+    out = inner - middle
+    out[:, 1] = 0
+    frame[chosen] = inner - 4e-3 * out / out.norm(dim=1, keepdim=True)
+    answer = frame.requires_grad_()
+    objective = PositionObjective(
+        told([answer]), PositionConfig(position=0, patch=0, normal=0, body=0, layers=1.0, rollout=0), "float32"
+    )
+    objective.progress = 1.0
+    losses = objective(batch)
+    losses[0].backward()
+    assert answer.grad.norm(dim=1).nonzero()[:, 0].tolist() == chosen.tolist()
+    assert 0.02**2 < losses[5].item() < 0.05**2  # 4 mm in dm, a little less to the flat faces
+    assert ((-answer.grad[chosen] * out).sum(dim=1) > 0).all()
+
+
+def test_rollouts_before_the_loss(data):
+    """The step from which predictions replace the truth would not be that of the sample, or gradients would flow
+    through earlier steps. Exact."""
+    network = network_of()
+    batch = batch_of(data, network, ((0, 9), (1, 9)), ahead=4)
+    answers = [batch.frames[3 + k] + 0.001 * (k + 1) for k in range(5)]
+    batch = dataclasses.replace(batch, draw=torch.tensor([0.0, 0.5]))  # from the start, and from the middle
+    objective = PositionObjective(told(answers), PositionConfig(rollout=4, body=0, layers=0), "float32")
+    objective.progress = 1.0
+    assert objective.ahead(batch) == 4
+    objective(batch)
+    seen, modes = objective.network.seen, objective.network.modes
+    assert modes == [(False, False)] * 4 + [(True, True)]
+    first, second = (batch.sample_of_vertex == k for k in (0, 1))
+    for k, inputs in enumerate(seen):
+        assert torch.equal(inputs.next_body, batch.body[3 + k])
+        frames = [inputs.vertices, *inputs.previous]
+        for j, frame in enumerate(frames):  # frame t - j
+            number = k - 1 - j  # of the answer that it is, if it is one
+            for mine, start in ((first, 0), (second, 2)):
+                predicted = number >= start or (number >= 0 and start == 0)
+                wanted = answers[number] if predicted else batch.frames[2 + k - j]
+                assert torch.equal(frame[mine], wanted[mine]), (k, j, start)
+
+
+def test_rollouts_grow(data):
+    """Long rollouts would come before the network can do a step, or never. Exact."""
+    batch = batch_of(data, network_of(), ahead=9)
+    objective = PositionObjective(network_of(), PositionConfig(rollout=9), "float32")
+    found = []
+    for epoch in range(10):
+        objective.progress = (epoch + 0.5) / 10
+        found.append(objective.ahead(batch))
+    assert found == list(range(10))
+
+
+def test_several_steps_with_gradient(data):
+    """A prediction would not be the input of the next step, or no gradient would flow through it."""
+    network = network_of().train()
+    batch = batch_of(data, network, steps=3)
+    losses = PositionObjective(network, PositionConfig(), "float32")(batch)
+    losses[0].backward()
+    long = network.decoder[-1].weight.grad.clone()
+    network.zero_grad()
+    assert torch.isfinite(long).all()
+    single = batch_of(data, network)
+    PositionObjective(network, PositionConfig(), "float32")(single)[0].backward()
+    assert (long - network.decoder[-1].weight.grad).abs().max() > 1e-6
+
+
+def test_a_few_steps_lower_the_loss(data):
+    """Gradients would not lead downhill. The loss of one batch falls to less than half within 20 steps."""
+    network = network_of(residual=True).train()
+    builder = builder_of(data, network)
+    batches = [builder.build([(0, t), (1, t)], None, np.random.default_rng(t)) for t in (4, 6, 8)]
+    network.set_statistics(position_statistics(batches, network))
+    objective = PositionObjective(network, PositionConfig(body=0.0, layers=0.0), "float32")
+    optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    found = []
+    for _ in range(20):
+        optimiser.zero_grad()
+        losses = objective(batches[0])
+        losses[0].backward()
+        optimiser.step()
+        found.append(losses[0].item())
+    assert found[-1] < 0.5 * found[0]
+
+
+def test_a_run(data, tmp_path):
+    """`train --network layersnet` would not train, validate on whole outfits, save, or resume with the same losses."""
+    options = {
+        "network": "layersnet", "overrides": SHAPE, "steps": 6, "batch_size": 2, "validate_every": 4,
+        "outfit": PositionConfig(rollout=2), "lr": 1e-3,
+    }  # fmt: skip
+    path = train(config_for(data, tmp_path / "run", **options))
+    loaded = checkpoint.load(path)
+    assert isinstance(loaded, LayersNet)
+    assert (loaded.acceleration_std != 1).any()
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert any(np.isfinite(line.get("rollout_error_cm", np.nan)) for line in lines)
+    assert {"loss_position", "loss_normal", "loss_layers"} < entries_of(tmp_path / "run")[0].keys()
+    again = train(config_for(data, tmp_path / "run", **(options | {"resume": True, "steps": 8})))
+    assert len(entries_of(tmp_path / "run")) == 8
+    assert again.exists()
+
+
+def test_settings_that_do_not_fit():
+    """A setting would be silently without effect, or end in a stack trace."""
+    with pytest.raises(ValueError, match="predict positions are not compiled"):
+        TrainConfig("data", "out", steps=1, network="layersnet", compile=True)
+    with pytest.raises(ValueError, match=r"outfit.body must be at least 0, got -1"):
+        PositionConfig(body=-1)
+    with pytest.raises(ValueError, match=r"outfit.rollout must be at most 64, got 100"):
+        PositionConfig(rollout=100)
+
+
+@pytest.mark.parametrize("cold", [True, False])
+def test_recorded_outfits_are_rolled_out_garment_by_garment(data, cold):
+    """Validation would simulate an outfit as one garment, or without its wind and materials. Bit for bit."""
+    sequence, simulator = Sequence.load(data / "d"), Simulator(network_of(), "cpu")
+    newest, first = 4, 4 if cold else 2
+    found = predict(simulator, sequence, newest, 5, cold=cold)
+    garments = list(sequence.worn)
+    assert [len(garment.vertices) for garment in garments] == [len(sequence.garment.vertices) // 2] * 2
+    assert sequence.materials == (MATERIAL, None)
+    body = sequence.body()
+    part = BodyMotion(body.vertices[first:10], body.faces, body.fps)
+    known = [np.array(sequence.vertices[first : newest + 1, layer.vertices]) for layer in sequence.layers]
+    start = {"first_vertices": [k[0] for k in known]} if cold else {"history": known}
+    direct = simulator.rollout(garments, part, materials=[MATERIAL, None], wind=sequence.wind[first:10], **start)
+    for layer, motion in zip(sequence.layers, direct, strict=True):
+        np.testing.assert_array_equal(found[:, layer.vertices], motion.vertices[newest + 1 - first :])
+
+
+def test_a_material_that_is_none(data, tmp_path):
+    """A manifest of nonsense would end in a stack trace."""
+    wrong = {"garments": [GARMENTS[0], {"name": "outer", "material": {"density": -1.0}}]}
+    sequence = Sequence.load(sequences.write(tmp_path, "e", frames=8, spoil=two_layers, manifest=wrong))
+    with pytest.raises(MeshError, match=r"e: material of outer: a material's density must be positive"):
+        _ = sequence.materials
+
+
+class Drift(GarmentNetwork):
+    """Every vertex moves on at one learned speed."""
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.speed = torch.nn.Parameter(torch.zeros(3))
+
+    def layout(self, garments, packed, *, face_splits=1):
+        return None
+
+    def predict(self, inputs, layout, *, bfloat16=False):
+        return VertexStep(inputs.vertices + self.speed)
+
+
+class DriftArchitecture(Architecture):
+    config, subsets = NetworkConfig, False
+
+    def build(self, config):
+        return Drift(config)
+
+    def memory(self, sizes, config):
+        return {"network": 0}
+
+    def flops(self, config, faces, components, rows):
+        return 0, 0
+
+
+@pytest.mark.parametrize("positions", [True, False])
+def test_any_network_that_predicts_positions(data, tmp_path, monkeypatch, positions):
+    """A user's network of positions could not be trained; or one whose kind hides that would end in a stack trace."""
+    module = types.ModuleType("drift")
+    module.ARCHITECTURE = DriftArchitecture()
+    module.ARCHITECTURE.positions = positions
+    monkeypatch.setitem(sys.modules, "drift", module)
+    monkeypatch.setitem(ARCHITECTURES, "drift", "drift")
+    module.ARCHITECTURE.presets = {"drift": NetworkConfig(architecture="drift", history=3)}
+    options = {"network": "drift", "overrides": (), "steps": 4, "batch_size": 2, "outfit": PositionConfig(rollout=1)}
+    config = config_for(data, tmp_path / "run", **options, unroll=UnrollConfig(steps=2))
+    if positions:
+        assert checkpoint.load(train(config)).speed.abs().min() > 1e-5
+        return
+    with pytest.raises(ValueError, match=r"a Drift has no forward_normalised.* set positions = True"):
+        train(config)

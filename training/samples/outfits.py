@@ -1,0 +1,202 @@
+"""Samples for networks that predict positions: whole outfits on their bodies, with materials and wind, in some frames.
+
+A sample is a sequence and the newest frame t of a history. The batch holds the recorded frames t-K-2 ... t+G. A rollout
+of K steps ends at t and G further steps have a loss; frames before the first one repeat it on a body that
+stands still, as in a cold start. Each sample has a random number from 0 to 1, by which the objective chooses the step
+from which predictions replace the truth, and a displacement of its history (noise.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgarment.kernels.mesh.laplacian import components
+from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.flops import step_flops
+from warpgarment.nn.inputs import FrameInputs
+from warpgarment.nn.network import GarmentNetwork
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.material import Material
+from warpgarment.objects.pack import PackedBodies, PackedGarments
+from warpgarment.training.data.sequence import Sequence
+
+from .drawing import displacement, part_of
+from .interactions import UnusableSequence
+from .noise import NoiseBasis, NoiseConfig
+
+
+class OutfitData:
+    """One training sequence: an outfit with its body, materials and wind.
+
+    Args:
+        sequence: The loaded sequence.
+        folder: Folder of the sequence.
+        network: Settings of the network for which samples are made.
+        device: Device on which samples are built.
+
+    Raises:
+        UnusableSequence: The sequence has too few frames, or positions that are not finite.
+    """
+
+    def __init__(self, sequence: Sequence, folder: Path, network: NetworkConfig, device: torch.device) -> None:
+        self.name, self.device, self.source = Path(folder).name, device, sequence
+        recorded = np.asarray(sequence.vertices, np.float32)
+        if len(recorded) < network.history + 1:
+            raise UnusableSequence(f"{len(recorded)} frames, fewer than history + 1 = {network.history + 1}")
+        if not np.isfinite(recorded).all():
+            frame = int(np.nonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0][0])
+            raise UnusableSequence(f"garment positions are not finite from frame {frame}")
+        self.vertices = torch.as_tensor(np.array(recorded), device=device)
+        self.garments, whole = list(sequence.worn), sequence.garment
+        self.faces = torch.as_tensor(np.array(whole.faces, np.int32), device=device)
+        vertex_component, _, self.components = components(len(whole.vertices), np.asarray(whole.faces))
+        self.noise = NoiseBasis(np.asarray(whole.faces), np.asarray(vertex_component), np.asarray(whole.pins))
+        unknown = (np.nan,) * len(fields(Material))
+        self.materials = np.array([unknown if m is None else astuple(m) for m in sequence.materials], np.float32)
+        self.wind = np.zeros((len(recorded), 3), np.float32) if sequence.wind is None else np.asarray(sequence.wind)
+
+    @cached_property
+    def body(self) -> BodyMotion:
+        """The part of the body with which cloth collides."""
+        return self.source.body()
+
+    @property
+    def count(self) -> int:
+        """Number of samples: newest frames 0..T-2."""
+        return len(self.vertices) - 1
+
+
+@dataclass(frozen=True)
+class OutfitBatch:
+    """Outfits in N = K + 3 + G frames, packed; metres, world space. A sample is one outfit on one body."""
+
+    packed: PackedGarments
+    bodies: PackedBodies
+    layout: Any  # of the network
+    frames: torch.Tensor  # [N,V,3] recorded positions of garments
+    body: torch.Tensor  # [N,U,3] bodies
+    wind: torch.Tensor  # [N,B,3] velocity of the air [m/s]
+    materials: torch.Tensor  # [B,M]; NaN for a garment without one
+    delta: torch.Tensor  # [3,V,3] displacement of the three frames of a history, newest first
+    draw: torch.Tensor  # [number of samples], from 0 to 1
+    sample_of_garment: torch.Tensor  # int64 [B]
+    sample_of_vertex: torch.Tensor  # int64 [V]
+    steps: int  # G
+    ids: list[tuple[str, int]]  # name of the sequence, newest frame
+
+    @property
+    def ahead(self) -> int:
+        """Largest number of steps K of a rollout before those with a loss."""
+        return len(self.frames) - 3 - self.steps
+
+    def recorded(self, frame: int) -> list[torch.Tensor]:
+        """Recorded and displaced positions [V,3] of a frame of the batch and of the two before it."""
+        return [self.frames[frame - k] + self.delta[k] for k in range(3)]
+
+    def inputs(self, recent: list[torch.Tensor], frame: int, reads: frozenset[str]) -> FrameInputs:
+        """What a network gets of a frame; the features of faces are empty.
+
+        Args:
+            recent: Positions of garments in this frame and the two before it, [V,3] each.
+            frame: Number of the frame in the batch, at least 2.
+            reads: Optional inputs that the network reads.
+        """
+        body, nothing, past = self.body, self.frames.new_zeros((0, 0, 0)), "previous" in reads
+        return FrameInputs(
+            nothing,
+            nothing,
+            recent[0],
+            body[frame],
+            body[frame + 1],
+            previous=torch.stack(recent[1:]) if past else None,
+            previous_body=torch.stack([body[frame - 1], body[frame - 2]]) if past else None,
+            materials=self.materials if "materials" in reads else None,
+            wind=torch.stack([self.wind[frame + 1], self.wind[frame]]) if "wind" in reads else None,
+            bodies=self.bodies,
+        )
+
+    def work(self, config: NetworkConfig) -> tuple[int, int]:
+        """Number of samples, and of operations of the steps with a loss (`nn/flops.py`)."""
+        faces, garments = len(self.packed.faces), self.packed.count
+        return len(self.ids), self.steps * step_flops(config, 1, faces, garments)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Arrays that are saved if the loss of the batch is not finite."""
+        tensors = {"frames": self.frames, "body": self.body, "wind": self.wind, "materials": self.materials}
+        tensors |= {"delta": self.delta, "draw": self.draw, "faces": self.packed.faces}
+        return {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+
+
+class OutfitBuilder:
+    """Builds batches of outfits.
+
+    Args:
+        sequences: Training sequences.
+        network: The network in training, which makes the layouts.
+        noise: Perturbation of histories.
+        ahead: Largest number of steps K of a rollout before those with a loss.
+        steps: Number of steps G with a loss.
+    """
+
+    def __init__(
+        self, sequences: list[OutfitData], network: GarmentNetwork, noise: NoiseConfig, ahead: int, steps: int
+    ) -> None:
+        self.sequences, self.network, self.noise, self.ahead, self.steps = sequences, network, noise, ahead, steps
+        self.device, self.subsets = sequences[0].device, False
+
+    def reaches(self, sequence: int, newest: int) -> bool:
+        """Whether all frames after `newest` that have a loss are recorded."""
+        return newest + self.steps < len(self.sequences[sequence].vertices)
+
+    @torch.no_grad()
+    def build(
+        self,
+        picks: list[tuple[int, int]],
+        faces: int | None,
+        rng: np.random.Generator,
+        displacements: list[np.ndarray | None] | None = None,
+        part: slice = slice(None),
+    ) -> OutfitBatch:
+        """Builds one batch, or a part of it, of all faces of every outfit; the arguments are those of
+        `Builder.build`, and `faces` has no effect."""
+        picks, streams, overrides = part_of(picks, rng, displacements, part)
+        mine, history = [self.sequences[s] for s, _ in picks], self.network.config.history
+        past, bodies, wind, deltas, draws = [], [], [], [], []
+        for (_, t), data, stream, override in zip(picks, mine, streams, overrides, strict=True):
+            frames = np.arange(t - self.ahead - 2, t + self.steps + 1).clip(0)
+            delta = displacement(data, history, self.noise, stream, override)
+            past.append(data.vertices[torch.from_numpy(frames).to(self.device)])
+            bodies.append(np.asarray(data.body.vertices[frames], np.float32))
+            wind.append(np.repeat(data.wind[frames][:, None], len(data.garments), axis=1))
+            deltas.append(np.zeros((history, *past[-1].shape[1:]), np.float32) if delta is None else delta[::-1])
+            draws.append(stream.random())
+        garments = [garment for data in mine for garment in data.garments]
+        sample = np.repeat(np.arange(len(mine)), [len(data.garments) for data in mine])
+        packed = PackedGarments.pack(garments, self.device)
+        vertices = [data.body.vertices.shape[1] for data in mine]
+
+        def send(array: np.ndarray) -> torch.Tensor:
+            return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+        sample_of_garment = send(sample)
+        return OutfitBatch(
+            packed=packed,
+            bodies=PackedBodies.pack([data.body.faces for data in mine], vertices, sample.tolist(), self.device),
+            layout=self.network.layout(garments, packed),
+            frames=torch.cat(past, dim=1),
+            body=send(np.concatenate(bodies, axis=1)),
+            wind=send(np.concatenate(wind, axis=1).astype(np.float32)),
+            materials=send(np.concatenate([data.materials for data in mine])),
+            delta=send(np.concatenate(deltas, axis=1)),
+            draw=send(np.array(draws, np.float32)),
+            sample_of_garment=sample_of_garment,
+            sample_of_vertex=sample_of_garment[packed.garment_of_vertex.long()],
+            steps=self.steps,
+            ids=[(data.name, t) for (_, t), data in zip(picks, mine, strict=True)],
+        )

@@ -1,0 +1,91 @@
+"""Converts materials and wind, as users give them, to the inputs of networks that read them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgarment.nn.network import GarmentNetwork
+from warpgarment.objects.material import Material
+
+from .arguments import as_array
+
+FASTEST = 100.0  # m/s; faster air than in any storm is a mistake of unit
+Materials = Material | Sequence[Material | None] | None
+
+
+def as_materials(
+    materials: Materials, count: int, network: GarmentNetwork, device: torch.device
+) -> torch.Tensor | None:
+    """Materials as a tensor.
+
+    Args:
+        materials: One material for all garments; a sequence with one, or None, for each garment; or None.
+        count: Number of garments B.
+        network: The network that is to read them.
+        device: Device of the result.
+
+    Returns:
+        The fields of the materials, float32 [B,M], NaN for a garment without one; None if None is given.
+
+    Raises:
+        ValueError: The network reads no materials, or a sequence has another length.
+        TypeError: An entry is no material.
+    """
+    if materials is None:
+        return None
+    refuse(network, "materials")
+    given = [materials] * count if isinstance(materials, Material) else list(materials)
+    if len(given) != count:
+        raise ValueError(f"{count} garments and {len(given)} materials; give one for each, or a single one for all")
+    for item in given:
+        if not isinstance(item, Material | None):
+            raise TypeError(f"expected a Material or None, got {type(item).__name__}")
+    unknown = (np.nan,) * len(fields(Material))
+    rows = [unknown if item is None else astuple(item) for item in given]
+    return torch.tensor(rows, dtype=torch.float32, device=device)
+
+
+def as_wind(wind: Any, count: int, network: GarmentNetwork, *, one: bool = False) -> np.ndarray | None:
+    """Wind as an array.
+
+    Args:
+        wind: Velocity of the air [m/s], shape [3], [T,3], or [T,B,3] with one for each garment; or None.
+        count: Number of garments B.
+        network: The network that is to read it.
+        one: Whether it is the wind of one frame.
+
+    Returns:
+        Velocities [m/s], float32 [T,B,3]; None if None is given.
+
+    Raises:
+        ValueError: The network reads no wind; the shape is another one; a number is not finite; or the air is faster
+            than 100 m/s.
+    """
+    if wind is None:
+        return None
+    refuse(network, "wind")
+    given = as_array(wind)
+    shape, given = given.shape, given[None] if given.ndim == 1 else given
+    if given.ndim == 2:
+        given = given[:, None]
+    if given.ndim != 3 or not len(given) or given.shape[1] not in (1, count) or given.shape[2] != 3:
+        raise ValueError(f"wind must have shape [3], [T,3] or [T,{count},3], got {list(shape)}")
+    if one and len(given) != 1:
+        raise ValueError(f"wind of one frame must have shape [3] or [1,{count},3], got {len(given)} frames")
+    speed = np.linalg.norm(given, axis=-1)
+    if not np.isfinite(given).all():
+        raise ValueError(f"wind holds NaN or infinity (first: frame {int(np.argwhere(~np.isfinite(speed))[0, 0])})")
+    if speed.max() > FASTEST:
+        raise ValueError(f"wind of {speed.max():,.0f} m/s; it must be at most {FASTEST:.0f} m/s. Check its unit")
+    return np.array(np.broadcast_to(given, (len(given), count, 3)), np.float32)
+
+
+def refuse(network: GarmentNetwork, name: str) -> None:
+    """Raises ValueError if a network does not read an input that was given."""
+    if name not in network.reads:
+        raise ValueError(f"{name} given, but a {type(network).__name__} reads none; a LayersNet does")
