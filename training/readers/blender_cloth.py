@@ -24,6 +24,8 @@ from warpgarment.kernels.wind import AIR_DENSITY, DRAG
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 
+from .fields import LARGEST
+
 MIDDLE_MASS = 0.5  # middle of D-LAYERS' range of Blender's mass of a vertex, 0.2 to 0.8
 
 
@@ -59,7 +61,7 @@ def blender_material(
     numbers: list[Any] = [cloth.get(key) for key in ("mass", "tension_stiffness", "bending_stiffness", "self_friction")]
     if friction is not None:
         numbers[3] = friction
-    if not all(isinstance(n, (int, float)) and np.isfinite(n) and n >= 0 for n in numbers) or 0 in numbers[:2]:
+    if not all(isinstance(n, (int, float)) and 0 <= n <= LARGEST for n in numbers) or 0 in numbers[:2]:
         return None
     mass, tension, bending, friction = map(float, numbers)
     area, lengths = _area(garment), _edge_lengths(garment)
