@@ -29,7 +29,7 @@ from warpgarment.objects.status import RolloutStatus
 from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
-from .arguments import Layers, as_array, counted, known_frames, listed, outfits, per_garment
+from .arguments import Layers, as_array, counted, known_frames, listed, outfits, per_garment, warn_of_crossing_start
 from .frame import Frame
 from .graph import GraphedFrames
 from .history import History
@@ -205,6 +205,7 @@ class Simulator:
                 state = self._advance(state, body_at(frame)) if frame >= given else states[frame]
                 if not recording.add(state.now.outcome, last=frame == total - 1):
                     break
+        warn_of_crossing_start(garments, [statuses[0] for statuses in recording.statuses])
         results = []
         for i, (worn, statuses) in enumerate(zip(garments, recording.statuses, strict=True)):
             if not statuses[-1].finite:
