@@ -6,12 +6,14 @@ import ipctk
 import numpy as np
 import pytest
 import torch
-from support.scenes import body, network, simulator, skirt, tube, walk
+from support.scenes import Failing, body, network, simulator, skirt, tube, walk
 
+from benchmarks.frames import FrameCounts
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.status import RolloutStatus, Verdict
 from warpgarment.sim.arguments import outfits
+from warpgarment.sim.stages.meet import Meet
 
 SHAKING = body(8, lambda t: (0.03 * (t % 2), 0.0, 0.02 * t), lambda t: (0.0, 0.15 * t, 0.1 * (t % 2)))
 
@@ -100,10 +102,33 @@ def test_a_start_that_crosses_is_told():
     assert "layers" in first[0].message
 
 
+def test_a_frame_of_layers_is_decided_on_the_device(monkeypatch):
+    """The host would wait for a GPU in the middle of a frame, or a GPU get other layers than a CPU: no number is looked
+    at if every motion is tried, and the results are the same bits. Launches do not grow with the number of outfits."""
+    counts = []
+    for number in (1, 4):
+        garments = [garment for _ in range(number) for garment in layered()]
+        layers = [[2 * k, 2 * k + 1] for k in range(number)]
+        sim = simulator(network())
+        state = sim.start(garments, SHAKING.vertices[0], SHAKING.faces, layers=layers)
+        state = sim.step(state, SHAKING.vertices[1])
+        counts.append(FrameCounts(state.scene, state.now, torch.from_numpy(SHAKING.vertices[2])))
+    assert counts[0].reads == counts[1].reads == []
+    assert counts[0].launches == counts[1].launches
+    early = simulator(restless()).rollout(layered(), SHAKING, layers=True)
+    made = Meet.__init__
+
+    def on_device(self, *args):
+        made(self, *args)
+        self.early_exit = False
+
+    monkeypatch.setattr(Meet, "__init__", on_device)
+    late = simulator(restless()).rollout(layered(), SHAKING, layers=True)
+    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(early, late, strict=True))
+
+
 def test_a_garment_that_fails_does_not_hold_the_others():
     """NaN of one layer would spread to the other."""
-    from support.scenes import Failing
-
     garments = layered()
     with pytest.warns(RuntimeWarning, match="stopped"):
         motions = simulator(network(Failing)).rollout(garments, walk(6), layers=True)
