@@ -49,7 +49,7 @@ class Meet:
 
     Attributes:
         on: Whether there is any outfit. Otherwise the stage does nothing.
-        early_exit: Whether the host looks if a smoother motion is needed. On a GPU it does not, and all are tried.
+        early_exit: Whether the host looks if a smoother motion or another round is needed. On a GPU all are done.
     """
 
     def __init__(
@@ -107,7 +107,9 @@ class Meet:
         with self._timings("layers"), torch.no_grad():
             start = self._start(before, after, features, finite)
             wanted = self._contacts.pushed(start, after)
-            steps = safe_steps(self._contacts, start, wanted, self._outfit_of_vertex, self._count)
+            steps = safe_steps(
+                self._contacts, start, wanted, self._outfit_of_vertex, self._count, early_exit=self.early_exit
+            )
             moving = finite[self._packed.garment_of_vertex.long()][:, None]
             positions = torch.where(moving, steps.positions, after)
             behind = (wanted - positions).norm(dim=1)
