@@ -58,6 +58,7 @@ class FrameCounts:
     def __init__(self, scene, now, next_body: torch.Tensor) -> None:
         self.launches: Counter[str] = Counter()
         early, scene.contact.early_exit = scene.contact.early_exit, False
+        looks, scene.meet.early_exit = scene.meet.early_exit, False
         patches = [mock.patch.object(wp, name, self._counted(getattr(wp, name))) for name in ("launch", "launch_tiled")]
         refit = wp.Mesh.refit
 
@@ -78,6 +79,7 @@ class FrameCounts:
             for patch in patches:
                 patch.stop()
             scene.contact.early_exit = early
+            scene.meet.early_exit = looks
         self.operators = seen.counts
         # Sizes of the compliance matrices are on the host.
         self.reads = [name for name, tensor in seen.read if tensor.dtype != torch.int64 or tensor.numel() != 1]

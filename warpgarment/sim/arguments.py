@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -11,6 +12,7 @@ import torch
 from warpgarment.errors import MeshError
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
+from warpgarment.objects.status import RolloutStatus
 
 
 def as_array(values: Any) -> np.ndarray:
@@ -140,6 +142,20 @@ def outfits(layers: Layers, body_of_garment: Sequence[int]) -> list[list[int]]:
         if len({body_of_garment[garment] for garment in outfit}) > 1:
             raise ValueError(f"the garments {outfit} of outfit {number} are on different bodies; give them one")
     return found
+
+
+def warn_of_crossing_start(garments: Sequence[Garment], first: Sequence[RolloutStatus]) -> None:
+    """Warns by name of garments that cross in the first frame; what crosses there is not kept apart later."""
+    for number, (garment, status) in enumerate(zip(garments, first, strict=True)):
+        layers, itself = status.layer_crossings or 0, status.self_crossings or 0
+        if layers or itself:
+            warnings.warn(
+                f"{layers:,} pairs of triangles of {garment.name or f'garment {number}'} and other garments of its "
+                f"outfit, and {itself:,} of its own, cross in the first frame. They will not be kept apart. Start from "
+                "garments that lie over each other, innermost first in layers",
+                RuntimeWarning,
+                stacklevel=4,
+            )
 
 
 def counted(frames: range, progress: bool) -> Any:

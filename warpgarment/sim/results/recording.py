@@ -13,6 +13,7 @@ from warpgarment.objects.clock import Clock
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.status import RolloutStatus
+from warpgarment.sim.arguments import warn_of_crossing_start
 from warpgarment.sim.frame import Frame
 from warpgarment.sim.scene import Scene
 
@@ -127,6 +128,7 @@ class Recording:
             fps: Frames per second of the rollout.
             given: Known first frames of each garment, [K,V,3], which are returned as they are; None: none.
         """
+        warn_of_crossing_start(garments, [statuses[0] for statuses in self.statuses])
         results = []
         for i, (garment, clock, statuses) in enumerate(zip(garments, clocks, self.statuses, strict=True)):
             if not statuses[-1].finite:

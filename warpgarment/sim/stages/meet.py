@@ -49,6 +49,7 @@ class Meet:
 
     Attributes:
         on: Whether there is any outfit. Otherwise the stage does nothing.
+        early_exit: Whether the host looks if a smoother motion or another round is needed. On a GPU all are done.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Meet:
     ) -> None:
         self._packed, self._timings, self._count, self.on = packed, timings, len(layers), bool(layers)
         device = packed.faces.device
-        self._early_exit = device.type == "cpu"
+        self.early_exit = device.type == "cpu"
         self._unmeasured = torch.full((packed.count, FIGURES), torch.nan, device=device)
         if not self.on:
             return
@@ -106,7 +107,9 @@ class Meet:
         with self._timings("layers"), torch.no_grad():
             start = self._start(before, after, features, finite)
             wanted = self._contacts.pushed(start, after)
-            steps = safe_steps(self._contacts, start, wanted, self._outfit_of_vertex, self._count)
+            steps = safe_steps(
+                self._contacts, start, wanted, self._outfit_of_vertex, self._count, early_exit=self.early_exit
+            )
             moving = finite[self._packed.garment_of_vertex.long()][:, None]
             positions = torch.where(moving, steps.positions, after)
             behind = (wanted - positions).norm(dim=1)
@@ -139,7 +142,7 @@ class Meet:
             self._contacts.find(start, after)
             if attempt + 1 < len(REACHES):
                 crossing[:-1] = crossing[:-1] & newly_crossing(self._contacts, before, self._count)
-                if self._early_exit and not crossing[:-1].any():
+                if self.early_exit and not crossing[:-1].any():
                     break
         return start
 
