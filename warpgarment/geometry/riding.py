@@ -18,7 +18,6 @@ import igl
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from warpgarment.kernels.mesh.laplacian import components
 
 AREA = 0.02
 """Largest area of a piece that is carried, as a share of that of the largest piece."""
@@ -47,6 +46,8 @@ def loose_pieces(vertices: np.ndarray, faces: np.ndarray, held: np.ndarray | Non
         faces: Vertex indices, shape [F,3].
         held: Vertices whose pieces are to stay cloth, such as pins, shape [P].
     """
+    from warpgarment.kernels.mesh.laplacian import components  # loads torch, which naming a garment need not
+
     of_vertex, of_face, count = components(len(vertices), faces)
     unit = np.full(len(vertices), -1)
     if count < 2 or len(faces) == 0:

@@ -9,7 +9,6 @@ import numpy as np
 from warpgarment.geometry.riding import loose_pieces
 from warpgarment.geometry.seams import coinciding_borders
 from warpgarment.io.source import Source
-from warpgarment.kernels.mesh.laplacian import components
 
 from .body import BodyMotion
 from .garment import Garment
@@ -69,6 +68,8 @@ class Facts(NamedTuple):
         cls, vertices: np.ndarray, faces: np.ndarray, fps: float | None = None, source: Source | None = None
     ) -> Facts:
         """Figures of positions [m], shape [T,V,3], and faces [F,3]; what has indices out of range has no pieces."""
+        from warpgarment.kernels.mesh.laplacian import components  # loads torch
+
         first = np.asarray(vertices[0], np.float64)
         finite = first[np.isfinite(first).all(axis=1)]
         x, y, z = np.ptp(finite, axis=0).tolist() if len(finite) else (0.0, 0.0, 0.0)
