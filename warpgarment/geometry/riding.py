@@ -18,7 +18,6 @@ import igl
 import numpy as np
 from scipy.sparse import csr_matrix
 
-
 AREA = 0.02
 """Largest area of a piece that is carried, as a share of that of the largest piece."""
 COMPACT = 0.06
