@@ -44,7 +44,7 @@ def test_a_network_of_a_users_own(tmp_path):
         f"import warpgarment as wg; wg.Simulator.from_pretrained({str(tmp_path / 'run' / 'network.safetensors')!r})"
     )
     done = subprocess.run([sys.executable, "-c", elsewhere], cwd=tmp_path, capture_output=True, text=True)
-    assert 'architecture must be "faces" or "patches", got \'alone\'' in done.stderr
+    assert 'architecture must be "faces", "patches" or "layers", got \'alone\'' in done.stderr
 
 
 def insert(path: Path, line: str, after: str) -> None:

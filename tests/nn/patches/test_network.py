@@ -289,7 +289,7 @@ def test_checkpoint_round_trip(tmp_path):
     }
     faces = build_network(NetworkConfig.small(embedding=16, heads=2, layers=1, history=2))
     assert type(faces) is ManifoldAwareTransformer
-    with pytest.raises(ValueError, match='architecture must be "faces" or "patches", got \'tokens\''):
+    with pytest.raises(ValueError, match='architecture must be "faces", "patches" or "layers", got \'tokens\''):
         NetworkConfig(architecture="tokens")
     checkpoint.save(faces, tmp_path / "faces.safetensors")
     from safetensors.torch import load_file, save_file

@@ -262,11 +262,9 @@ def test_rollouts_grow(data):
     """Long rollouts would come before the network can do a step, or never. Exact."""
     batch = batch_of(data, network_of(), ahead=9)
     objective = PositionObjective(network_of(), PositionConfig(rollout=9), "float32")
-    found = []
     for epoch in range(10):
         objective.progress = (epoch + 0.5) / 10
-        found.append(objective.ahead(batch))
-    assert found == list(range(10))
+        assert objective.ahead(batch) == epoch
 
 
 def test_several_steps_with_gradient(data):
@@ -311,8 +309,8 @@ def test_a_run(data, tmp_path):
     loaded = checkpoint.load(path)
     assert isinstance(loaded, LayersNet)
     assert (loaded.acceleration_std != 1).any()
-    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert any(np.isfinite(line.get("rollout_error_cm", np.nan)) for line in lines)
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert any(np.isfinite(line.get("rollout_error_cm", np.nan)) for line in log)
     assert {"loss_position", "loss_normal", "loss_layers"} < entries_of(tmp_path / "run")[0].keys()
     again = train(config_for(data, tmp_path / "run", **(options | {"resume": True, "steps": 8})))
     assert len(entries_of(tmp_path / "run")) == 8
