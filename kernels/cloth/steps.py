@@ -186,14 +186,15 @@ def safe_steps(
     normal = as_argument(contacts.normal, wp.vec3)
     with torch_stream(device) as warp_device:
         for shrink in SHRINK:
+            previous = share.clone() if early_exit else None
             inputs = [model, shrink, normal, at_start, now, old]
             wp.launch(shrink_kernel, dim=members, inputs=inputs, outputs=[new], device=warp_device)
-            if early_exit and torch.equal(share, smaller):
-                break
             share.copy_(smaller)
             wp.launch(spread_kernel, dim=members, inputs=[model, old], outputs=[new], device=warp_device)
             inputs = [at_start, at_end, new]
             wp.launch(place_kernel, dim=len(start), inputs=inputs, outputs=[old, now], device=warp_device)
+            if previous is not None and torch.equal(previous, share):
+                break
         inputs = [model, normal, at_start, now]
         wp.launch(unsafe_kernel, dim=members, inputs=inputs, outputs=[as_argument(held, wp.int32)], device=warp_device)
     stays = torch.cat([held > 0, held.new_zeros(1, dtype=torch.bool)])  # the last entry is that of outfit -1
