@@ -225,7 +225,7 @@ def _check_saved(path: str | Path, data: dict[str, np.ndarray]) -> None:
     sizes: dict[str, int] = {}
     for name, (kinds, shape) in _SAVED.items():
         array = data[name]
-        fits = array.dtype.kind in kinds and array.ndim == len(shape)
+        fits = array.dtype.kind in kinds and array.ndim == len(shape) and array.size > 0
         if not fits or any(sizes.setdefault(s, n) != n for s, n in zip(shape, array.shape, strict=True)):
             raise MeshError(f"{path}: {name} is {array.dtype} {list(array.shape)}, which does not fit a body.")
     bounds = (("faces", "V", 0), ("bone_indices", "B", 0), ("bone_parents", "B", -1))

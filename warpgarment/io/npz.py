@@ -80,7 +80,7 @@ def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
         raise
     except Exception as error:  # TokenError, SyntaxError, RecursionError, OverflowError, ...
         raise ValueError(f"no header of an array ({type(error).__name__}: {str(error)[:100]})") from None
-    if min(shape, default=0) < 0:
+    if any(isinstance(size, bool) or size < 0 for size in shape):  # True is an integer to NumPy's check of a header
         raise ValueError(f"no header of an array (its shape is {list(shape)})")
     return shape, by_columns, dtype
 
