@@ -7,8 +7,9 @@ faces is safe if one direction n separates it at C and at S,
 
 since on straight ways the gap along n is at least the mean of both, weighted by time. The pair may move as it likes as
 long as it stays apart, which bounds by distances would forbid. Where no such n is found, the α of the corners are made
-smaller, those of vertices around them follow, and all pairs are looked at again. At α = 0 every pair is safe that was
-apart at C. If some pair is not safe after the last round, its whole outfit stays at C for this frame.
+smaller, those of vertices around them follow, and all pairs of the outfit are looked at again, until all are safe. At
+α = 0 every pair is safe that was apart at C. If some pair is not safe after the last round, its whole outfit stays at C
+for this frame.
 
 | symbol | code | what |
 | --- | --- | --- |
@@ -90,6 +91,7 @@ def shrink_kernel(
     share: wp.array[wp.float32],
     # Out:
     smaller: wp.array[wp.float32],  # made smaller
+    unsafe: wp.array[wp.int32],  # marked, of each outfit
 ):
     m = wp.tid()
     for k in range(kept_pairs(pairs, m)):
@@ -97,6 +99,7 @@ def shrink_kernel(
         if wp.dot(n, n) > 0.0:
             o = pairs.partners[m, k]
             if not is_safe(pairs, m, o, n, start, points):
+                unsafe[pairs.outfit[m]] = 1
                 for i in range(3):
                     wp.atomic_min(smaller, pairs.faces[m][i], shrink * share[pairs.faces[m][i]])
                     wp.atomic_min(smaller, pairs.faces[o][i], shrink * share[pairs.faces[o][i]])
@@ -108,11 +111,14 @@ def spread_kernel(
     pairs: Pairs,
     # In:
     share: wp.array[wp.float32],
+    unsafe: wp.array[wp.int32],
     # Out:
     smaller: wp.array[wp.float32],  # made smaller
 ):
-    """Vertices around one whose α is small follow it."""
+    """Vertices around one whose α is small follow it, in outfits that are not safe yet."""
     m = wp.tid()
+    if unsafe[pairs.outfit[m]] == 0:
+        return
     face = pairs.faces[m]
     least = wp.min(share[face[0]], wp.min(share[face[1]], share[face[2]])) + SLOPE
     if least < 1.0:
@@ -181,20 +187,21 @@ def safe_steps(
     smaller.fill_(1.0)
     points = end.clone()
     held = torch.zeros(outfits, dtype=torch.int32, device=device)
+    unsafe = torch.zeros((len(SHRINK), outfits), dtype=torch.int32, device=device)
     at_start, at_end, now = (as_argument(tensor, wp.vec3) for tensor in (start, end, points))
     old, new = as_argument(share, wp.float32), as_argument(smaller, wp.float32)
     normal = as_argument(contacts.normal, wp.vec3)
     with torch_stream(device) as warp_device:
-        for shrink in SHRINK:
-            previous = share.clone() if early_exit else None
+        for shrink, failed in zip(SHRINK, unsafe, strict=True):
+            failing = as_argument(failed, wp.int32)
             inputs = [model, shrink, normal, at_start, now, old]
-            wp.launch(shrink_kernel, dim=members, inputs=inputs, outputs=[new], device=warp_device)
+            wp.launch(shrink_kernel, dim=members, inputs=inputs, outputs=[new, failing], device=warp_device)
+            if early_exit and not failed.any():
+                break
             share.copy_(smaller)
-            wp.launch(spread_kernel, dim=members, inputs=[model, old], outputs=[new], device=warp_device)
+            wp.launch(spread_kernel, dim=members, inputs=[model, old, failing], outputs=[new], device=warp_device)
             inputs = [at_start, at_end, new]
             wp.launch(place_kernel, dim=len(start), inputs=inputs, outputs=[old, now], device=warp_device)
-            if previous is not None and torch.equal(previous, share):
-                break
         inputs = [model, normal, at_start, now]
         wp.launch(unsafe_kernel, dim=members, inputs=inputs, outputs=[as_argument(held, wp.int32)], device=warp_device)
     stays = torch.cat([held > 0, held.new_zeros(1, dtype=torch.bool)])  # the last entry is that of outfit -1

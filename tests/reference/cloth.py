@@ -136,11 +136,12 @@ def safe_steps(start, end, faces, outfit, found, normal, shrinks):
     share, points = np.ones(len(start)), end.copy()
     for shrink in shrinks:
         smaller = share.copy()
-        for k in np.flatnonzero(apart & ~safe(start, points, faces, m, o, normal)):
+        wrong = np.flatnonzero(apart & ~safe(start, points, faces, m, o, normal))
+        for k in wrong:
             corner = np.concatenate([faces[m[k]], faces[o[k]]])
             smaller[corner] = np.minimum(smaller[corner], shrink * share[corner])
         share = smaller.copy()
-        for face in faces:
+        for face in faces[np.isin(outfit, outfit[m[wrong]])]:
             share[face] = np.minimum(share[face], smaller[face].min() + SLOPE)
         points = np.where(share[:, None] < 1, start + share[:, None] * (end - start), points)
     wrong = apart & ~safe(start, points, faces, m, o, normal)
