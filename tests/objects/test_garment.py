@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 import warpgarment as wg
-from warpgarment.io.polygons import triangulate
+from warpgarment.io.polygons import triangulate_counts
 
 
 def grid(columns=6, rows=4):
@@ -249,7 +249,7 @@ def test_polygons_are_covered_exactly_once():
             axes = np.linalg.qr(random.normal(size=(3, 3)))[0]
             normal = np.cross(axes[0], axes[1])
             points = flat @ axes[:2] + random.normal(size=3)
-            faces = triangulate(points, [list(range(corners))])
+            faces = triangulate_counts(points, np.array([corners]), np.arange(corners))
             parts = (
                 0.5
                 * np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]])

@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from warpgarment.errors import MeshError
 
 LARGEST = 5_000  # corners of a polygon: cutting one into triangles takes time by the square of their number
-
-
-def triangulate(vertices: np.ndarray, polygons: Sequence[Sequence[int]]) -> np.ndarray:
-    """`triangulate_counts` for polygons that are lists of their corners."""
-    counts = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
-    indices = np.fromiter((corner for polygon in polygons for corner in polygon), np.int64, int(counts.sum()))
-    return triangulate_counts(vertices, counts, indices)
 
 
 def triangulate_counts(vertices: np.ndarray, counts: np.ndarray, indices: np.ndarray) -> np.ndarray:

@@ -107,7 +107,7 @@ class Scene:
             correctors=self.correctors,
             layers=layers,
         )
-        self.brought, self.topology = brought, bodies
+        self.brought = brought
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
         self.bodies = MovingBodies(body_vertices, bodies)

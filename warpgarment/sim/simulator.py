@@ -229,7 +229,7 @@ class Simulator:
             for frame in counted(range(total), progress):
                 known = frame < given
                 state = states[frame] if known else self._advance(state, body_at(frame), self._air(blown, frame))
-                if not recording.add(seen(state.scene, state.now), last=frame == total - 1):
+                if not recording.add(seen(state.scene, state.now.outcome, state.now.body), last=frame == total - 1):
                     break
         returned = brought.given if history is not None else None
         results = recording.motions(garments, [motions[i].clock for i in on], fps, returned)

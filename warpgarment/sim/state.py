@@ -53,7 +53,7 @@ class SimulationState(Generic[Vertices, Status]):
 
     @cached_property
     def _read(self) -> Outcome:
-        return read(self.scene, self.frame, [seen(self.scene, self.now)])[0]
+        return read(self.scene, self.frame, [seen(self.scene, self.now.outcome, self.now.body)])[0]
 
 
 def starting_states(

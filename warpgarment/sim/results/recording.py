@@ -14,7 +14,6 @@ from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.status import RolloutStatus
 from warpgarment.sim.arguments import warn_of_crossing_start
-from warpgarment.sim.frame import Frame
 from warpgarment.sim.scene import Scene
 
 READ_EVERY = 16  # number of frames of a rollout that a GPU computes before the host reads them
@@ -45,7 +44,7 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
         if brought is not None:
             parts = brought.restored(parts)
         if brought is not None and body:
-            depth[k] = np.maximum(depth[k], brought.depth(parts, torch.from_numpy(body[0][k]), scene.topology))
+            depth[k] = np.maximum(depth[k], brought.depth(parts, torch.from_numpy(body[0][k]), scene.packed_bodies))
         for part, sound in zip(parts, finite[k], strict=True):
             if not sound:
                 part[:] = np.nan
@@ -57,10 +56,16 @@ def read(scene: Scene, first: int, frames: Sequence[tuple[torch.Tensor, ...]]) -
     return found
 
 
-def seen(scene: Scene, frame: Frame) -> tuple[torch.Tensor, ...]:
-    """What `read` reads of a frame: its outcome, and the bodies where vertices are carried that may be inside them."""
+def seen(scene: Scene, outcome: tuple[torch.Tensor, ...], body: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """What `read` reads of a frame.
+
+    Args:
+        scene: The scene that the frame belongs to.
+        outcome: Its `Frame.outcome`.
+        body: Packed positions of the bodies [m], [U,3]: read where vertices are carried, which may be inside them.
+    """
     rides = scene.brought is not None and scene.brought.rides
-    return (*frame.outcome, frame.body) if rides else frame.outcome
+    return (*outcome, body) if rides else outcome
 
 
 def _met(figures: np.ndarray) -> dict[str, Any]:

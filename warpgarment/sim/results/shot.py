@@ -15,7 +15,7 @@ from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.sim.scene import Scene
 
-from .recording import read
+from .recording import read, seen
 
 Rate: TypeAlias = float | Literal["body"] | None
 
@@ -78,7 +78,7 @@ def brought_to_shot(
     motions: Sequence[GarmentMotion],
     on: Sequence[int],
     bodies: Sequence[BodyMotion],
-    seen: Sequence[BodyMotion],
+    simulated: Sequence[BodyMotion],
     rates: Sequence[float],
     frames: int | None,
 ) -> list[GarmentMotion]:
@@ -93,18 +93,18 @@ def brought_to_shot(
         motions: Its results, at the network's rate.
         on: Which body each garment is on.
         bodies: The bodies at the rates of the results, see `bodies_of_shot`.
-        seen: The bodies at the network's rate.
+        simulated: The bodies at the network's rate.
         rates: Frames per second of the results on each body.
         frames: No more than so many frames; None: all.
     """
     found = [motion.resampled(rates[b], frames) for motion, b in zip(motions, on, strict=True)]
-    where = [now.clock.places(body.clock.times) for now, body in zip(seen, bodies, strict=True)]
+    where = [now.clock.places(body.clock.times) for now, body in zip(simulated, bodies, strict=True)]
     for frame in range(max(motion.frames for motion in found)):
         at = [min(frame, body.frames - 1) for body in bodies]
         shown = [body.vertices[t] for body, t in zip(bodies, at, strict=True)]
         same = [
             places[t] % 1 == 0 and np.array_equal(body, now.vertices[int(places[t])])
-            for places, t, body, now in zip(where, at, shown, seen, strict=True)
+            for places, t, body, now in zip(where, at, shown, simulated, strict=True)
         ]
         moving = [not same[b] and frame < m.frames and _is_finite(m, frame) for m, b in zip(found, on, strict=True)]
         if not any(moving):
@@ -116,8 +116,7 @@ def brought_to_shot(
         moved, finite, depth, report = scene.contact(cloth, body, pending)
         solves = torch.stack([torch.zeros_like(report), report])
         tensors = (moved, finite, depth, solves, scene.meet.measure(moved, finite))
-        rides = scene.brought is not None and scene.brought.rides
-        outcome = read(scene, frame, [(*tensors, body) if rides else tensors])[0]
+        outcome = read(scene, frame, [seen(scene, tensors, body)])[0]
         for i in np.flatnonzero(moving):
             found[i].vertices[frame], found[i].status[frame] = outcome.parts[i], outcome.statuses[i]
     return found
