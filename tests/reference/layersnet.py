@@ -82,7 +82,7 @@ class Twin:
             inner[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = rotation
         return basis @ inner @ basis.T
 
-    def __call__(self, garments, clusters, past, body, body_faces, materials, wind):
+    def __call__(self, garments, clusters, past, body, body_faces, materials, wind, skin=None):
         """Positions at t+1 [V,3] and accelerations of patches [P,3].
 
         Args:
@@ -93,6 +93,8 @@ class Twin:
             body_faces: Faces of the body.
             materials: A row of the fields of `Material`, or None, for each garment.
             wind: Velocity of the air at t+1 and t, for each garment.
+            skin: Rotations [3,V,3,3] and positions [3,V,3] of the garments as smooth skin at t+1, t, t-1; needed with
+                `base="body"`.
         """
         c = self.c
         past = [[np.asarray(x, float) for x in frames] for frames in past]
@@ -112,6 +114,18 @@ class Twin:
         raw = [state(x, roots[1:]) for x in past]
         vertices = np.concatenate(raw)
         bodies = state(body[:3], roots[:3])
+        carried = vertices @ np.kron([[0], [1], [0], [0]], np.eye(3)) + vertices[:, :3]
+        base = carried @ turn + roots[0]  # inertia
+        offsets = np.zeros((len(vertices), 0))
+        if c.base == "body":
+            turns, places = skin
+            new, old = np.concatenate([x[0] for x in past]), np.concatenate([x[1] for x in past])
+            u = [
+                np.stack([turns[0][v] @ turns[k][v].T @ (x[v] - places[k][v]) for v in range(len(x))])
+                for k, x in ((1, new), (2, old))
+            ]
+            base = places[0] + u[0] + 0.75 * (u[0] - u[1])
+            offsets = np.concatenate([u[0] @ turn.T, (u[0] - u[1]) @ turn.T], 1)
         normals = np.zeros_like(body[0])
         for f in body_faces:
             for corner in f:
@@ -140,6 +154,7 @@ class Twin:
         own = np.array([min((np.linalg.norm(rest[v] - middle[p]), p) for p in range(count) if v in sets[p])[1]
                         for v in range(total)])  # fmt: skip
         patch = np.stack([vertices[m].mean(0) for m in member])
+        offset = np.stack([offsets[m].mean(0) for m in member])
 
         # what is near
         def near_body(point, most):
@@ -152,8 +167,13 @@ class Twin:
             return [q for q in allowed if not joined[p, q]][: c.patch_neighbours]
 
         # tokens: patches, body, attributes, wind, gravity
-        def normal(x):
-            return (x - self.w["state_mean"]) / self.w["state_std"]
+        def normal(x, about=None):
+            x = (x - self.w["state_mean"]) / self.w["state_std"]
+            if c.base != "body":
+                return x
+            none = np.zeros((*x.shape[:-1], 6))
+            more = none if about is None else (about - self.w["offset_mean"]) / self.w["offset_std"]
+            return np.concatenate([x, more], -1)
 
         attributes = np.zeros((len(garments), 5))
         for g, row in enumerate(materials):
@@ -168,7 +188,7 @@ class Twin:
         ])  # fmt: skip
         pulls = (np.stack(gravity) - self.w["acceleration_mean"]) / self.w["acceleration_std"]
         parts = {
-            "patch": self.encode("state", normal(patch)),
+            "patch": self.encode("state", normal(patch, offset)),
             "body": self.encode("state", normal(bodies)),
             "attributes": self.encode("attributes", attributes),
             "wind": self.encode("wind", winds),
@@ -237,7 +257,7 @@ class Twin:
                 return np.concatenate([heads[h] @ x[h * width : (h + 1) * width] for h in range(c.heads)])
 
             token = turned(parts["body"][near[0]]) if near else np.zeros(c.embedding)
-            x = np.concatenate([(rotation @ relative.reshape(4, 3).T).T.ravel(), turned(value[p]), token])
+            x = np.concatenate([(rotation @ relative.reshape(-1, 3).T).T.ravel(), turned(value[p]), token])
             for layer in (0, 2):
                 x = np.maximum(self.linear(f"decoder.{layer}", x), 0)
             answer = rotation.T @ self.linear("decoder.4", x)
@@ -248,8 +268,9 @@ class Twin:
             away = np.linalg.norm(patch[:, :3] - vertices[v, :3], axis=1)
             closer = [q for q in np.argsort(away, kind="stable") if joined[own[v], q] and away[q] < away[own[v]]]
             chosen = [own[v], *closer[:3]]
-            answers = [decode(normal(vertices[v]) - normal(patch[q]), q, vertices[v, :3]) for q in chosen]
-            acceleration = np.mean(answers, axis=0)
-            after[v] = turn.T @ (vertices[v, :3] + vertices[v, 3:6] + acceleration) + roots[0]
-        patches = np.stack([decode(np.zeros(12), p, patch[p, :3]) for p in range(count)])
+            mine = normal(vertices[v], offsets[v])
+            answers = [decode(mine - normal(patch[q], offset[q]), q, vertices[v, :3]) for q in chosen]
+            after[v] = base[v] + turn.T @ np.mean(answers, axis=0)
+        nothing = np.zeros(len(normal(vertices[0])))
+        patches = np.stack([decode(nothing, p, patch[p, :3]) for p in range(count)])
         return after, patches

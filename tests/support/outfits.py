@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from support.scenes import tube, walk
+from warpgarment.kernels.features.skin import Skin, bind
 from warpgarment.nn.inputs import FrameInputs
 from warpgarment.nn.layers.config import LayersNetConfig
 from warpgarment.nn.layers.network import LayersNet
@@ -58,6 +59,9 @@ def layersnet(seed: int = 0, **changes) -> LayersNet:
             "acceleration_std": torch.tensor([1.5e-3, 2e-3, 1e-3]),
         }
     )
+    if network.config.base == "body":
+        offset = {"offset_mean": torch.linspace(-0.01, 0.01, 6), "offset_std": torch.cat([0.1 * spread, 0.03 * spread])}
+        network.set_statistics(offset)
     return network.eval()
 
 
@@ -110,9 +114,17 @@ def inputs_of(outfits: list[Outfit], dtype: torch.dtype = torch.float64) -> tupl
     wind = send(np.concatenate([o.wind for o in outfits]).transpose(1, 0, 2))
     inputs = FrameInputs(
         torch.zeros(0), torch.zeros(0), frames[0], body[1], body[0], torch.stack(frames[1:]), torch.stack(body[2:]),
-        send(np.array(rows)), wind, bodies=bodies,
+        send(np.array(rows)), wind, bodies=bodies, skin=bound(outfits, on),
     )  # fmt: skip
     return garments, inputs
+
+
+def bound(outfits: list[Outfit], on: list[int]) -> Skin:
+    """The garments at t-2 as bound to the bodies at t-2."""
+    offsets = np.cumsum([0] + [len(o.body[0]) for o in outfits])
+    cloth = [x[2] for o in outfits for x in o.past]
+    of_vertex = np.repeat(on, [len(x) for x in cloth])
+    return bind(np.concatenate(cloth), of_vertex, np.concatenate([o.body[3] for o in outfits]), offsets, CPU)
 
 
 def layout_of(network: LayersNet, garments: list[Garment]):

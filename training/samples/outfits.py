@@ -3,7 +3,9 @@
 A sample is a sequence and the newest frame t of a history. The batch holds the recorded frames t-K-2 ... t+G. A rollout
 of K steps ends at t and G further steps have a loss; frames before the first one repeat it on a body that
 stands still, as in a cold start. Each sample has a random number from 0 to 1, by which the objective chooses the step
-from which predictions replace the truth, and a displacement of its history (noise.py).
+from which predictions replace the truth, and a displacement of its history (noise.py). Garments are bound to their
+bodies (kernels/features/skin.py) where a simulation would be: mostly in the first frame of the sequence, otherwise in
+any frame before t-K of the last `RECENT` ones, as if the simulation had started there.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpgarment.kernels.features.skin import Skin, bind
 from warpgarment.kernels.mesh.laplacian import components
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import step_flops
@@ -29,6 +32,9 @@ from warpgarment.training.data.sequence import Sequence
 from .drawing import displacement, part_of
 from .interactions import UnusableSequence
 from .noise import NoiseBasis, NoiseConfig
+
+RECENT = 40  # frames
+FROM_FIRST = 0.7  # share of samples that are bound in the first frame
 
 
 class OutfitData:
@@ -81,6 +87,7 @@ class OutfitBatch:
     layout: Any  # of the network
     frames: torch.Tensor  # [N,V,3] recorded positions of garments
     body: torch.Tensor  # [N,U,3] bodies
+    skin: Skin  # the garments as bound to their bodies in some earlier frame
     wind: torch.Tensor  # [N,B,3] velocity of the air [m/s]
     materials: torch.Tensor  # [B,M]; NaN for a garment without one
     delta: torch.Tensor  # [3,V,3] displacement of the three frames of a history, newest first
@@ -119,6 +126,7 @@ class OutfitBatch:
             materials=self.materials if "materials" in reads else None,
             wind=torch.stack([self.wind[frame + 1], self.wind[frame]]) if "wind" in reads else None,
             bodies=self.bodies,
+            skin=self.skin if "skin" in reads else None,
         )
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
@@ -167,7 +175,7 @@ class OutfitBuilder:
         `Builder.build`, and `faces` has no effect."""
         picks, streams, overrides = part_of(picks, rng, displacements, part)
         mine, history = [self.sequences[s] for s, _ in picks], self.network.config.history
-        past, bodies, wind, deltas, draws = [], [], [], [], []
+        past, bodies, wind, deltas, draws, bound = [], [], [], [], [], []
         for (_, t), data, stream, override in zip(picks, mine, streams, overrides, strict=True):
             frames = np.arange(t - self.ahead - 2, t + self.steps + 1).clip(0)
             delta = displacement(data, history, self.noise, stream, override)
@@ -176,10 +184,15 @@ class OutfitBuilder:
             wind.append(np.repeat(data.wind[frames][:, None], len(data.garments), axis=1))
             deltas.append(np.zeros((history, *past[-1].shape[1:]), np.float32) if delta is None else delta[::-1])
             draws.append(stream.random())
+            start = max(t - self.ahead - 2, 0)
+            early = stream.random() < FROM_FIRST
+            frame = 0 if early else int(stream.integers(max(start - RECENT, 0), start + 1))
+            bound.append((data.vertices[frame].cpu().numpy(), np.asarray(data.body.vertices[frame], np.float64)))
         garments = [garment for data in mine for garment in data.garments]
         sample = np.repeat(np.arange(len(mine)), [len(data.garments) for data in mine])
         packed = PackedGarments.pack(garments, self.device)
         vertices = [data.body.vertices.shape[1] for data in mine]
+        packed_bodies = PackedBodies.pack([data.body.faces for data in mine], vertices, sample.tolist(), self.device)
 
         def send(array: np.ndarray) -> torch.Tensor:
             return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
@@ -187,7 +200,14 @@ class OutfitBuilder:
         sample_of_garment = send(sample)
         return OutfitBatch(
             packed=packed,
-            bodies=PackedBodies.pack([data.body.faces for data in mine], vertices, sample.tolist(), self.device),
+            bodies=packed_bodies,
+            skin=bind(
+                np.concatenate([cloth for cloth, _ in bound]),
+                np.repeat(np.arange(len(mine)), [len(cloth) for cloth, _ in bound]),
+                np.concatenate([body for _, body in bound]),
+                packed_bodies.vertex_offsets,
+                self.device,
+            ),
             layout=self.network.layout(garments, packed),
             frames=torch.cat(past, dim=1),
             body=send(np.concatenate(bodies, axis=1)),

@@ -11,7 +11,7 @@ from warpgarment.nn.network import GarmentNetwork
 from .outfits import OutfitBatch
 from .single_step import Batch
 
-POSITION_FLOORS = {"state": 1e-3, "acceleration": 1e-4}  # [m] and [m/frame]; [m/frame^2]
+POSITION_FLOORS = {"state": 1e-3, "offset": 1e-3, "acceleration": 1e-4}  # [m], [m/frame]; [m/frame^2]
 FLOORS = {"feature": 3e-3, "velocity": 1e-3, "psi": 1e-3, "singular_value": 1e-3, "q": 3e-4}  # least deviations
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 if TYPE_CHECKING:
+    from warpgarment.kernels.features.skin import Skin
     from warpgarment.objects.garment import Garment
     from warpgarment.objects.pack import PackedBodies
 
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
 class FrameInputs(NamedTuple):
     """A packed batch of F faces, V vertices and C connected components at frame t, in physical units and world space.
 
-    `previous`, `previous_body`, `materials`, `wind` and `pairs` are None unless the network `reads` them; it gets
-    `previous_body` with `previous`. `materials` and `wind` may be None all the same.
+    `previous`, `previous_body`, `materials`, `wind`, `pairs` and `skin` are None unless the network `reads` them; it
+    gets `previous_body` with `previous`. `materials` and `wind` may be None all the same.
     """
 
     features: torch.Tensor  # [F,H,K] oldest first, all channels of kernels/features/channels.py
@@ -30,6 +31,7 @@ class FrameInputs(NamedTuple):
     wind: torch.Tensor | None = None  # [2,B,3] velocity of the air at t+1 and t [m/s]
     pairs: torch.Tensor | None = None  # int32 [P,2] vertices of different garments that are near each other
     bodies: PackedBodies | None = None  # topology of the bodies, and which garment is on which
+    skin: Skin | None = None  # the garments as bound to their bodies in the first frame
 
 
 class VertexStep(NamedTuple):

@@ -38,7 +38,7 @@ class GarmentNetwork(nn.Module):
 
     Attributes:
         reads: Names of the optional fields of `FrameInputs` that `predict` needs: `previous`, `materials`, `wind`,
-            `pairs`.
+            `pairs`, `skin`.
         statistics: Buffers of the normalisation and their lengths.
     """
 

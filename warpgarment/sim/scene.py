@@ -16,6 +16,7 @@ from warpgarment.errors import MeshError
 from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
+from warpgarment.kernels.features.skin import Skin, bind
 from warpgarment.nn.inputs import FrameInputs, VertexStep
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import Step
@@ -36,7 +37,7 @@ from .frame import Frame
 from .surface import Surface
 from .timing import Timings
 
-GIVEN = frozenset({"previous", "materials", "wind"})  # optional inputs of networks that simulations have
+GIVEN = frozenset({"previous", "materials", "wind", "skin"})  # optional inputs of networks that simulations have
 FARTHEST = 1.0  # metres; a garment whose nearest vertex is farther from its body has a wrong position or unit
 
 
@@ -115,6 +116,10 @@ class Scene:
         body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
         self._refuse_far(first_vertices, body_of_vertex)
         self.layout = network.layout(garments, packed, face_splits=face_splits)
+        self.skin: Skin | None = None
+        if "skin" in network.reads:
+            where = (first_vertices, body_of_vertex, body_vertices)
+            self.skin = bind(*(part.cpu().numpy() for part in where), bodies.vertex_offsets, device)
 
         margins = [clearance(garment) if epsilon is None else epsilon for garment in garments]
         self.centroids = ComponentCentroids(packed)
@@ -176,6 +181,7 @@ class Scene:
             materials=self.materials,
             wind=now.wind if "wind" in self.network.reads else None,
             bodies=self.packed_bodies,
+            skin=self.skin,
         )
 
     def predict(self, inputs: FrameInputs) -> Step | VertexStep:

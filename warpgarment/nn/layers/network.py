@@ -34,10 +34,12 @@ from .config import BODY, VERTEX_PATCHES, LayersNetConfig
 from .inputs import ATTRIBUTES, Seen, acceleration, moved, positions, seen
 from .turns import Bases, frames, turned
 
-STATE, GRAVITY, WIND = 12, 6, 22
+STATE, ABOUT, GRAVITY, WIND = 12, 6, 6, 22
 KINDS = ("state", "attributes", "wind", "gravity")  # of tokens, in their order: patches and body vertices are "state"
+READS = frozenset({"previous", "materials", "wind"})
 WAITS = ("cpu",)  # devices on which the number of real entries of a table is read; a GPU would have to be waited for
 STATISTICS = {"state_mean": STATE, "state_std": STATE, "acceleration_mean": 3, "acceleration_std": 3}
+STATISTICS_ABOUT = STATISTICS | {"offset_mean": ABOUT, "offset_std": ABOUT}  # with `base="body"`
 
 
 class LayersLayout(NamedTuple):
@@ -62,10 +64,10 @@ class LayersNet(GarmentNetwork):
         config: Settings of the network.
     """
 
-    reads: ClassVar[frozenset[str]] = frozenset({"previous", "materials", "wind"})
-    statistics: ClassVar[Mapping[str, int]] = STATISTICS
     config: LayersNetConfig
 
+    offset_mean: torch.Tensor
+    offset_std: torch.Tensor
     state_mean: torch.Tensor
     state_std: torch.Tensor
     acceleration_mean: torch.Tensor
@@ -73,8 +75,9 @@ class LayersNet(GarmentNetwork):
 
     def __init__(self, config: LayersNetConfig) -> None:
         super().__init__(config)
-        width = config.embedding
-        sizes = (STATE, len(ATTRIBUTES), WIND, GRAVITY)
+        width, state = config.embedding, STATE + ABOUT * (config.base == "body")
+        self.state = state  # numbers of the state of a garment or body
+        sizes = (state, len(ATTRIBUTES), WIND, GRAVITY)
         self.encoders = nn.ModuleDict(
             {
                 kind: nn.Sequential(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
@@ -87,12 +90,22 @@ class LayersNet(GarmentNetwork):
         self.bases = Bases(config.heads, config.head_width, config.rotation)
         hidden = config.decoder
         self.decoder = nn.Sequential(
-            nn.Linear(STATE + 2 * width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3)
+            nn.Linear(state + 2 * width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3)
         )
         if config.residual:  # untrained, cloth moves on as it moved
             last = cast(nn.Linear, self.decoder[-1])
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """Optional inputs; see `GarmentNetwork.reads`."""
+        return READS | {"skin"} if self.config.base == "body" else READS
+
+    @property
+    def statistics(self) -> Mapping[str, int]:
+        """Buffers of the normalisation and their lengths."""
+        return STATISTICS_ABOUT if self.config.base == "body" else STATISTICS
 
     def layout(self, garments: Sequence[Garment], packed: PackedGarments, *, face_splits: int = 1) -> LayersLayout:
         """The patches of a batch, and its hash grid; `face_splits` has no effect."""
@@ -105,7 +118,7 @@ class LayersNet(GarmentNetwork):
         decoded, cloth = self.decoded(inputs, layout, bfloat16=bfloat16), layout.cloth
         view = decoded.seen
         outfit = view.outfit_of_garment[cloth.garment_of_patch]
-        patches = moved(cloth.means(view.vertices), decoded.patches, view.heading[outfit], view.next_root[outfit])
+        patches = moved(cloth.means(view.base), decoded.patches, view.heading[outfit])
         return VertexStep(positions(view, decoded.vertices), patches)
 
     def decoded(self, inputs: FrameInputs, layout: LayersLayout, *, bfloat16: bool = False) -> Decoded:
@@ -113,12 +126,13 @@ class LayersNet(GarmentNetwork):
         config, cloth = self.config, layout.cloth
         kind = inputs.vertices.device.type
         with torch.autocast(kind, enabled=False):
-            view = seen(inputs, cloth, fps=config.fps, canonical=config.heading == "canonical")
+            view = self._seen(inputs, cloth)
             patch_state = cloth.means(view.vertices)
             nearest, edges, body = self._edges(view, patch_state, layout)
-            state = (view.vertices - self.state_mean) / self.state_std
-            patch = (patch_state - self.state_mean) / self.state_std
+            state = self._normalised(view.vertices, view.offsets)
+            patch = self._normalised(patch_state, cloth.means(view.offsets))
             body_state = (view.body[body] - self.state_mean) / self.state_std
+            body_state = nn.functional.pad(body_state, (0, self.state - STATE))  # a body is at no offset from itself
             pull = (view.gravity - self.acceleration_mean) / self.acceleration_std
         with torch.autocast(kind, dtype=torch.bfloat16, enabled=bfloat16):
             encoded = [
@@ -141,8 +155,20 @@ class LayersNet(GarmentNetwork):
 
     def observed(self, inputs: FrameInputs, layout: LayersLayout, after: torch.Tensor) -> dict[str, torch.Tensor]:
         """States of garments and bodies together, and accelerations; see `GarmentNetwork.observed`."""
-        view = seen(inputs, layout.cloth, fps=self.config.fps, canonical=self.config.heading == "canonical")
-        return {"state": torch.cat([view.vertices, view.body]), "acceleration": acceleration(view, after)}
+        view = self._seen(inputs, layout.cloth)
+        found = {"state": torch.cat([view.vertices, view.body]), "acceleration": acceleration(view, after)}
+        return found | ({"offset": view.offsets} if self.config.base == "body" else {})
+
+    def _seen(self, inputs: FrameInputs, cloth: ClothLayout) -> Seen:
+        config = self.config
+        return seen(inputs, cloth, fps=config.fps, canonical=config.heading == "canonical", base=config.base)
+
+    def _normalised(self, state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+        """States [N,12] and offsets [N,6] or [N,0], in units of zero mean and unit variance, side by side."""
+        state = (state - self.state_mean) / self.state_std
+        if not offset.shape[1]:
+            return state
+        return torch.cat([state, (offset - self.offset_mean) / self.offset_std], dim=1)
 
     def _edges(
         self, view: Seen, patch_state: torch.Tensor, layout: LayersLayout
@@ -211,8 +237,8 @@ class LayersNet(GarmentNetwork):
             turn, beneath = eye.expand(len(point), 3, 3), of_patch.new_zeros((len(point), of_patch.shape[1]))
         # the basis and the first layer are one product: W (Q R Q^T e) = (W Q) (R Q^T e)
         first = cast(nn.Linear, self.decoder[0])
-        own, patches, bodies = first.weight.split([STATE, *2 * [received.shape[1]]], dim=1)
-        relative = turned(_by_axis(relative), turn, STATE // 3)
+        own, patches, bodies = first.weight.split([self.state, *2 * [received.shape[1]]], dim=1)
+        relative = turned(_by_axis(relative), turn, self.state // 3)
         hidden = torch.nn.functional.linear(relative, _by_axis(own), first.bias)
         for part, weight in ((of_patch.index_select(0, which), patches), (beneath, bodies)):
             hidden = hidden + turned(part, turn, triples) @ (weight @ basis).mT
@@ -260,7 +286,7 @@ def _start(width: int) -> nn.Sequential:
 
 
 def _by_axis(states: torch.Tensor) -> torch.Tensor:
-    """States [N,12], four vectors one after the other, sorted by x, y and z as `turned` expects it."""
+    """States [N,12] or [N,18], vectors one after the other, sorted by x, y and z as `turned` expects it."""
     return states.unflatten(1, (-1, 3)).mT.flatten(1)
 
 
