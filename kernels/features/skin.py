@@ -13,6 +13,7 @@ cloth, so a skirt between two legs stays whole.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -89,7 +90,7 @@ def bind(
     vertices, body = np.asarray(vertices, np.float64), np.asarray(body, np.float64)
     points, offset = np.zeros((len(vertices), BOUND), np.int64), np.zeros((len(vertices), BOUND, 3))
     weight, around, count = np.zeros((len(vertices), BOUND)), [], 0
-    for number, (first, last) in enumerate(zip(body_offsets[:-1], body_offsets[1:], strict=True)):
+    for number, (first, last) in enumerate(itertools.pairwise(body_offsets)):
         mine = np.flatnonzero(np.asarray(body_of_vertex) == number)
         part = body[first:last]
         _, near = cKDTree(part).query(part[_spread(part)], k=np.arange(1, AROUND + 1))

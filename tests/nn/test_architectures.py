@@ -19,6 +19,7 @@ from support.scenes import outfit, skirt, tube, walk
 
 from warpgarment.errors import CheckpointError
 from warpgarment.kernels.features.channels import FACE
+from warpgarment.kernels.features.skin import bind
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import ARCHITECTURES, GrowthError, architecture, build_network, preset
 from warpgarment.nn.config import NetworkConfig
@@ -191,11 +192,13 @@ def test_memory_is_within_its_forecast(kind, number):
     bodies = PackedBodies.pack([beneath.faces], [len(beneath.vertices)], [0] * number, CPU)
     body = torch.from_numpy((beneath.vertices * [0.9, 1.0, 0.9]).astype(np.float32))
     past = {"previous": rest.expand(2, -1, -1), "previous_body": body.expand(2, -1, -1), "bodies": bodies}
+    on = np.zeros(len(rest), np.int64)
+    skin = bind(rest.numpy(), on, body.numpy(), bodies.vertex_offsets, CPU)
 
     @torch.inference_mode()
     def call() -> None:
         layout = network.layout(garments, packed)
-        network.predict(FrameInputs(features, velocities, rest, body, body, **past), layout)
+        network.predict(FrameInputs(features, velocities, rest, body, body, skin=skin, **past), layout)
 
     sizes = NetworkSizes(garments, cpu=True, body_vertices=len(body))
     forecast = dict(architecture(kind).memory(sizes, config))

@@ -94,7 +94,7 @@ class Twin:
             materials: A row of the fields of `Material`, or None, for each garment.
             wind: Velocity of the air at t+1 and t, for each garment.
             skin: Rotations [3,V,3,3] and positions [3,V,3] of the garments as smooth skin at t+1, t, t-1; needed with
-                `base="body"`.
+                `carried_by="body"`.
         """
         c = self.c
         past = [[np.asarray(x, float) for x in frames] for frames in past]
@@ -117,7 +117,7 @@ class Twin:
         carried = vertices @ np.kron([[0], [1], [0], [0]], np.eye(3)) + vertices[:, :3]
         base = carried @ turn + roots[0]  # inertia
         offsets = np.zeros((len(vertices), 0))
-        if c.base == "body":
+        if c.carried_by == "body":
             turns, places = skin
             new, old = np.concatenate([x[0] for x in past]), np.concatenate([x[1] for x in past])
             u = [
@@ -169,7 +169,7 @@ class Twin:
         # tokens: patches, body, attributes, wind, gravity
         def normal(x, about=None):
             x = (x - self.w["state_mean"]) / self.w["state_std"]
-            if c.base != "body":
+            if c.carried_by != "body":
                 return x
             none = np.zeros((*x.shape[:-1], 6))
             more = none if about is None else (about - self.w["offset_mean"]) / self.w["offset_std"]

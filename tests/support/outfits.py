@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from support import sequences
 from support.scenes import tube, walk
 from warpgarment.kernels.features.skin import Skin, bind
 from warpgarment.nn.inputs import FrameInputs
@@ -17,8 +19,14 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 from warpgarment.objects.pack import PackedBodies, PackedGarments
+from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.outfits import OutfitBuilder, OutfitData
 
 CPU = torch.device("cpu")
+TRAINED = {"embedding": 32, "layers": 1, "feed_forward": 32, "heads": 4, "world_heads": 2, "decoder": 32}
+TRAINED |= {"patch_spacing": 0.1, "patch_radius": 0.1, "body_radius": 0.15}
+QUIET = NoiseConfig(position=0.0, offset=0.0)
 SMALL = {"embedding": 32, "layers": 2, "feed_forward": 24, "heads": 4, "world_heads": 2, "decoder": 24}
 SMALL |= {"patch_spacing": 0.12, "patch_radius": 0.12, "patch_neighbours": 4, "body_radius": 0.09, "residual": False}
 SILK, WOOL = Material(density=0.08, bend=2e-5, friction=0.1), Material(density=0.5, stretch=3e3, bend=1e-3)
@@ -59,7 +67,7 @@ def layersnet(seed: int = 0, **changes) -> LayersNet:
             "acceleration_std": torch.tensor([1.5e-3, 2e-3, 1e-3]),
         }
     )
-    if network.config.base == "body":
+    if network.config.carried_by == "body":
         offset = {"offset_mean": torch.linspace(-0.01, 0.01, 6), "offset_std": torch.cat([0.1 * spread, 0.03 * spread])}
         network.set_statistics(offset)
     return network.eval()
@@ -145,3 +153,51 @@ def turned_motion(motion: BodyMotion, rotation: np.ndarray, shift: np.ndarray) -
     return BodyMotion(
         motion.vertices @ rotation.T.astype(np.float32) + shift.astype(np.float32), motion.faces, motion.fps
     )
+
+
+def two_layers(content: dict) -> None:
+    """Makes an outfit of the tube and a wider one over it, in a wind."""
+    count = len(content["garment_rest_vertices"])
+    for name in ("garment_rest_vertices", "garment_vertices"):
+        inner = content[name]
+        middle = inner.mean(axis=-2, keepdims=True)
+        content[name] = np.concatenate([inner, middle + (inner - middle) * [1.2, 0.9, 1.2]], axis=-2).astype(np.float32)
+    faces = content["garment_faces"]
+    content["garment_faces"] = np.concatenate([faces, faces + count]).astype(np.int32)
+    content["garment_starts"] = np.array([0, count, 2 * count], np.int32)
+    frames = len(content["garment_vertices"])
+    content["wind"] = np.stack([np.linspace(0, 2, frames), np.zeros(frames), np.ones(frames)], 1).astype(np.float32)
+
+
+MATERIAL = Material(density=0.4, bend=1e-4)
+GARMENTS = [
+    {"name": "inner", "category": "tube", "material": MATERIAL.as_dict()},
+    {"name": "outer", "category": "tube", "material": None},
+]
+
+
+def recorded(root: Path) -> Path:
+    """Three sequences of two layers, and one for validation."""
+    for number, (name, split) in enumerate((("a", "train"), ("b", "train"), ("c", "train"), ("d", "validation"))):
+        extra = {"garments": GARMENTS}
+        sequences.write(root, name, split, seed=number, frames=16, spoil=two_layers, manifest=extra)
+    return root
+
+
+def network_of(**changes) -> LayersNet:
+    """A network with random weights and plausible statistics."""
+    torch.manual_seed(0)
+    network = LayersNet(LayersNetConfig(**(TRAINED | {"residual": False} | changes)))
+    network.set_statistics({"acceleration_std": torch.full((3,), 2e-3)})
+    return network
+
+
+def builder_of(data, network, *, ahead=0, steps=1, noise=QUIET) -> OutfitBuilder:
+    """A builder for the sequences a and b."""
+    loaded = [OutfitData(Sequence.load(data / name), data / name, network.config, CPU) for name in "ab"]
+    return OutfitBuilder(loaded, network, noise, ahead, steps)
+
+
+def batch_of(data, network, picks=((0, 5), (1, 9)), **options):
+    """The batch of two samples."""
+    return builder_of(data, network, **options).build(list(picks), None, np.random.default_rng(0))

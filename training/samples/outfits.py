@@ -10,6 +10,7 @@ any frame before t-K of the last `RECENT` ones, as if the simulation had started
 
 from __future__ import annotations
 
+import copy
 from dataclasses import astuple, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,7 @@ from warpgarment.nn.flops import step_flops
 from warpgarment.nn.inputs import FrameInputs
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 from warpgarment.objects.pack import PackedBodies, PackedGarments
 from warpgarment.training.data.sequence import Sequence
@@ -71,6 +73,18 @@ class OutfitData:
     def body(self) -> BodyMotion:
         """The part of the body with which cloth collides."""
         return self.source.body()
+
+    @cached_property
+    def mirrored(self) -> OutfitData:
+        """The sequence in a mirror that turns x about. Faces are wound the other way, so that normals point outward."""
+        other, flip = copy.copy(self), np.array([-1.0, 1.0, 1.0], np.float32)
+        other.vertices = self.vertices * torch.from_numpy(flip).to(self.device)
+        other.garments = [
+            Garment(g.vertices * flip, g.faces[:, ::-1].copy(), pins=g.pins, name=g.name) for g in self.garments
+        ]
+        other.faces, other.wind = self.faces[:, [0, 2, 1]].contiguous(), self.wind * flip
+        other.body = BodyMotion(self.body.vertices * flip, self.body.faces[:, ::-1].copy(), self.body.fps)
+        return other
 
     @property
     def count(self) -> int:
@@ -150,12 +164,20 @@ class OutfitBuilder:
         noise: Perturbation of histories.
         ahead: Largest number of steps K of a rollout before those with a loss.
         steps: Number of steps G with a loss.
+        mirror: Share of samples that are mirrored in x.
     """
 
     def __init__(
-        self, sequences: list[OutfitData], network: GarmentNetwork, noise: NoiseConfig, ahead: int, steps: int
+        self,
+        sequences: list[OutfitData],
+        network: GarmentNetwork,
+        noise: NoiseConfig,
+        ahead: int,
+        steps: int,
+        mirror: float = 0.0,
     ) -> None:
         self.sequences, self.network, self.noise, self.ahead, self.steps = sequences, network, noise, ahead, steps
+        self.mirror = mirror
         self.device, self.subsets = sequences[0].device, False
 
     def reaches(self, sequence: int, newest: int) -> bool:
@@ -175,6 +197,9 @@ class OutfitBuilder:
         `Builder.build`, and `faces` has no effect."""
         picks, streams, overrides = part_of(picks, rng, displacements, part)
         mine, history = [self.sequences[s] for s, _ in picks], self.network.config.history
+        if self.mirror:
+            shown = zip(mine, streams, strict=True)
+            mine = [data.mirrored if stream.random() < self.mirror else data for data, stream in shown]
         past, bodies, wind, deltas, draws, bound = [], [], [], [], [], []
         for (_, t), data, stream, override in zip(picks, mine, streams, overrides, strict=True):
             frames = np.arange(t - self.ahead - 2, t + self.steps + 1).clip(0)

@@ -123,7 +123,8 @@ def make_builder(config: TrainConfig, network: GarmentNetwork, sequences: list) 
         noise = dataclasses.replace(
             config.noise, position=less * config.noise.position, offset=less * config.noise.offset
         )
-        return OutfitBuilder(sequences, network, noise, config.outfit.rollout, config.unroll.steps)
+        ahead, steps, mirror = config.outfit.rollout, config.unroll.steps, config.augmentation.mirror
+        return OutfitBuilder(sequences, network, noise, ahead, steps, mirror)
     if type(network).forward_normalised is GarmentNetwork.forward_normalised:
         raise ValueError(
             f"a {type(network).__name__} has no forward_normalised, so it is not trained on steps of faces. If it "

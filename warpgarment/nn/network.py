@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import nn
@@ -42,8 +42,8 @@ class GarmentNetwork(nn.Module):
         statistics: Buffers of the normalisation and their lengths.
     """
 
-    reads: ClassVar[frozenset[str]] = frozenset()
-    statistics: ClassVar[Mapping[str, int]] = STATISTICS
+    reads: frozenset[str] = frozenset()
+    statistics: Mapping[str, int] = STATISTICS
 
     face_head: nn.Linear
     velocity_head: nn.Linear

@@ -118,8 +118,8 @@ class Scene:
         self.layout = network.layout(garments, packed, face_splits=face_splits)
         self.skin: Skin | None = None
         if "skin" in network.reads:
-            where = (first_vertices, body_of_vertex, body_vertices)
-            self.skin = bind(*(part.cpu().numpy() for part in where), bodies.vertex_offsets, device)
+            cloth, on, body = (part.cpu().numpy() for part in (first_vertices, body_of_vertex, body_vertices))
+            self.skin = bind(cloth, on, body, bodies.vertex_offsets, device)
 
         margins = [clearance(garment) if epsilon is None else epsilon for garment in garments]
         self.centroids = ComponentCentroids(packed)

@@ -21,7 +21,7 @@ from warpgarment.sim.simulator import Simulator
 
 SETTINGS = {
     "ours": {},
-    "published": {"rotation": "published", "heading": "world", "base": "inertia"},
+    "published": {"rotation": "published", "heading": "world", "carried_by": "inertia"},
     "far from the body": {"body_radius": 1e-3},
     "near patches": {"patch_radius": 0.3, "patch_neighbours": 3, "body_radius": 0.3},
 }
@@ -34,7 +34,8 @@ def twin(network, outfit):
     clusters = [garment_patches(g, spacing).patch[:, 0] for g in outfit.garments]
     materials = [None if m is None else dataclasses.astuple(m) for m in outfit.materials]
     skin = bound([outfit], [0] * len(meshes))
-    skin = [np.stack(part) for part in zip(*(map(np.asarray, skin(torch.tensor(y))) for y in outfit.body[:3]))]
+    places = [skin(torch.tensor(y)) for y in outfit.body[:3]]
+    skin = [np.stack([np.asarray(place[k]) for place in places]) for k in range(2)]
     return Twin(network)(meshes, clusters, outfit.past, outfit.body, outfit.body_faces, materials, outfit.wind, skin)
 
 
@@ -95,7 +96,7 @@ def test_turned_and_moved():
     outfit = moving()
     rotation, shift = Rotation.from_euler("y", 2.0).as_matrix(), np.array([3.0, 0.5, -2.0])
     for heading, base, holds in (("canonical", "inertia", 1e-9), ("canonical", "body", 1e-5), ("world", "body", None)):
-        network = layersnet(heading=heading, base=base).double()
+        network = layersnet(heading=heading, carried_by=base).double()
         expected = np.concatenate(answer(network, [outfit])) @ rotation.T + shift
         error = np.abs(np.concatenate(answer(network, [outfit.turned(rotation, shift)])) - expected).max()
         assert error > 1e-3 if holds is None else error < holds, (heading, base, error)
@@ -179,7 +180,7 @@ def test_acceleration_is_the_inverse():
     """Training would teach another acceleration than the one that leads to the recorded frame. 1e-12 m."""
     network, outfit = layersnet().double(), moving()
     garments, inputs = inputs_of([outfit])
-    view = seen(inputs, layout_of(network, garments).cloth, fps=30.0, canonical=True, base="body")
+    view = seen(inputs, layout_of(network, garments).cloth, fps=30.0, canonical=True, carried_by="body")
     wanted = torch.randn(len(inputs.vertices), 3, dtype=torch.float64)
     assert (acceleration(view, positions(view, wanted)) - wanted).abs().max() < 1e-12
 

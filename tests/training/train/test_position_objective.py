@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from support import sequences
+from support.outfits import GARMENTS, MATERIAL, TRAINED, batch_of, builder_of, network_of, recorded, two_layers
 from support.runs import config_for, entries_of
 
 from warpgarment.errors import MeshError
@@ -23,113 +24,22 @@ from warpgarment.nn.layers.config import LayersNetConfig
 from warpgarment.nn.layers.network import LayersNet
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.body import BodyMotion
-from warpgarment.objects.material import Material
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import predict
-from warpgarment.training.samples.noise import NoiseConfig
-from warpgarment.training.samples.outfits import OutfitBuilder, OutfitData
 from warpgarment.training.samples.statistics import position_statistics
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.position_objective import PositionConfig, PositionObjective, vertex_normals
 from warpgarment.training.train.start import train
 from warpgarment.training.train.unrolled_objective import UnrollConfig
 
-CPU = torch.device("cpu")
-SMALL = {"embedding": 32, "layers": 1, "feed_forward": 32, "heads": 4, "world_heads": 2, "decoder": 32}
-SMALL |= {"patch_spacing": 0.1, "patch_radius": 0.1, "body_radius": 0.15}
-QUIET = NoiseConfig(position=0.0, offset=0.0)
-SHAPE = tuple(f"{name}={value}" for name, value in SMALL.items())
-
-
-def two_layers(content: dict) -> None:
-    """Makes an outfit of the tube and a wider one over it, in a wind."""
-    count = len(content["garment_rest_vertices"])
-    for name in ("garment_rest_vertices", "garment_vertices"):
-        inner = content[name]
-        middle = inner.mean(axis=-2, keepdims=True)
-        content[name] = np.concatenate([inner, middle + (inner - middle) * [1.2, 0.9, 1.2]], axis=-2).astype(np.float32)
-    faces = content["garment_faces"]
-    content["garment_faces"] = np.concatenate([faces, faces + count]).astype(np.int32)
-    content["garment_starts"] = np.array([0, count, 2 * count], np.int32)
-    frames = len(content["garment_vertices"])
-    content["wind"] = np.stack([np.linspace(0, 2, frames), np.zeros(frames), np.ones(frames)], 1).astype(np.float32)
-
-
-MATERIAL = Material(density=0.4, bend=1e-4)
-GARMENTS = [
-    {"name": "inner", "category": "tube", "material": MATERIAL.as_dict()},
-    {"name": "outer", "category": "tube", "material": None},
-]
+SHAPE = tuple(f"{name}={value}" for name, value in TRAINED.items())
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Three sequences of two layers, and one for validation."""
-    root = tmp_path_factory.mktemp("layers")
-    for number, (name, split) in enumerate((("a", "train"), ("b", "train"), ("c", "train"), ("d", "validation"))):
-        extra = {"garments": GARMENTS}
-        sequences.write(root, name, split, seed=number, frames=16, spoil=two_layers, manifest=extra)
-    return root
-
-
-def network_of(**changes) -> LayersNet:
-    """A network with random weights and plausible statistics."""
-    torch.manual_seed(0)
-    network = LayersNet(LayersNetConfig(**(SMALL | {"residual": False} | changes)))
-    network.set_statistics({"acceleration_std": torch.full((3,), 2e-3)})
-    return network
-
-
-def builder_of(data, network, *, ahead=0, steps=1, noise=QUIET) -> OutfitBuilder:
-    """A builder for the sequences a and b."""
-    loaded = [OutfitData(Sequence.load(data / name), data / name, network.config, CPU) for name in "ab"]
-    return OutfitBuilder(loaded, network, noise, ahead, steps)
-
-
-def batch_of(data, network, picks=((0, 5), (1, 9)), **options):
-    """The batch of two samples."""
-    return builder_of(data, network, **options).build(list(picks), None, np.random.default_rng(0))
-
-
-def test_frames_of_a_batch(data):
-    """A sample would hold other frames, garments, materials or wind than its sequence. Exact."""
-    batch, network = batch_of(data, network_of(), ((0, 5), (1, 1)), ahead=2, steps=2), network_of()
-    assert batch.ahead == 2
-    parts = [Sequence.load(data / name) for name in "ab"]
-    count = len(parts[0].garment.vertices)
-    assert batch.packed.vertex_offsets == (0, count // 2, count, 3 * count // 2, 2 * count)
-    for k, (sequence, newest) in enumerate(zip(parts, (5, 1), strict=True)):
-        for i in range(7):
-            frame = max(newest - 4 + i, 0)  # a cold start repeats the first one
-            mine = batch.frames[i, k * count : (k + 1) * count]
-            np.testing.assert_array_equal(mine.numpy(), np.asarray(sequence.vertices[frame]))
-            body = batch.body[i].chunk(2)[k]
-            np.testing.assert_array_equal(body.numpy(), sequence.body().vertices[frame].astype(np.float32))
-            np.testing.assert_array_equal(batch.wind[i, 2 * k : 2 * k + 2].numpy(), [sequence.wind[frame]] * 2)
-    assert batch.materials[0].tolist() == pytest.approx(list(MATERIAL.as_dict().values()))
-    assert batch.materials[1].isnan().all()
-    inputs = batch.inputs(batch.recorded(4), 4, network.reads)
-    assert torch.equal(inputs.vertices, batch.frames[4])
-    assert torch.equal(inputs.previous, batch.frames[[3, 2]])
-    assert torch.equal(inputs.next_body, batch.body[5])
-    assert torch.equal(inputs.previous_body, batch.body[[3, 2]])
-    assert torch.equal(inputs.wind, batch.wind[[5, 4]])
-    assert inputs.bodies.body_of_garment.tolist() == [0, 0, 1, 1]
-
-
-def test_statistics(data):
-    """Inputs or outputs of the network would not have zero mean and unit variance. 1e-3."""
-    network = network_of()
-    batches = [batch_of(data, network, picks) for picks in (((0, 5), (1, 9)), ((0, 8), (1, 3)))]
-    found = position_statistics(batches, network)
-    network.set_statistics(found)
-    seen = [network.observed(b.inputs(b.recorded(2), 2, network.reads), b.layout, b.frames[3]) for b in batches]
-    for name in ("state", "acceleration"):
-        values = torch.cat([s[name] for s in seen])
-        scaled = (values - found[f"{name}_mean"]) / found[f"{name}_std"]
-        assert scaled.mean(dim=0).abs().max() < 1e-3
-        assert (scaled.std(dim=0) - 1).abs().max() < 1e-3 or (found[f"{name}_std"] <= 1.1e-3).any()
+    """Recorded outfits."""
+    return recorded(tmp_path_factory.mktemp("layers"))
 
 
 class Told(LayersNet):
@@ -149,7 +59,7 @@ class Told(LayersNet):
 def told(frames) -> Told:
     """A network that knows its answers."""
     torch.manual_seed(0)
-    return Told(LayersNetConfig(**SMALL)).told(frames).train()
+    return Told(LayersNetConfig(**TRAINED)).told(frames).train()
 
 
 def test_losses_of_known_frames(data):

@@ -23,8 +23,8 @@ class LayersNetConfig(NetworkConfig):
         world_heads: Number of heads that see world patches, body vertices, wind and gravity; the other heads see mesh
             patches and attributes.
         decoder: Width of the hidden layers of the decoder.
-        base: Where cloth goes before the network's accelerations are added: "body", on as it moved about its body, or
-            "inertia", on as it moved in space (see inputs.py).
+        carried_by: Where cloth goes before the network's accelerations are added: "body", on as it moved about its
+            body, or "inertia", on as it moved in space (see inputs.py).
         rotation: "orthogonal" turns hidden vectors by R_h = Q (R + R + R + R + R + 1) Q^T with an orthogonal Q;
             "published" by R_h = W R W^T of rank 3, which is no rotation (see turns.py).
         patch_radius: Largest distance between the centres of patches that a world edge joins [m].
@@ -45,7 +45,7 @@ class LayersNetConfig(NetworkConfig):
     patch_spacing: float = 0.08
     world_heads: int = 4
     decoder: int = 128
-    base: str = "body"
+    carried_by: str = "body"
     rotation: str = "orthogonal"
     patch_radius: float = 0.08
     patch_neighbours: int = 16
@@ -59,8 +59,8 @@ class LayersNetConfig(NetworkConfig):
             raise ValueError(f"world_heads must lie between 1 and heads - 1 = {self.heads - 1}, got {self.world_heads}")
         if self.rotation not in ("orthogonal", "published"):
             raise ValueError(f'rotation must be "orthogonal" or "published", got {self.rotation!r}')
-        if self.base not in ("body", "inertia"):
-            raise ValueError(f'base must be "body" or "inertia", got {self.base!r}')
+        if self.carried_by not in ("body", "inertia"):
+            raise ValueError(f'carried_by must be "body" or "inertia", got {self.carried_by!r}')
         if self.rotation == "orthogonal" and self.head_width < 4:
             raise ValueError(f"a head must be at least 4 wide to be turned, got {self.head_width}")
         for name in ("decoder", "patch_neighbours"):
@@ -80,7 +80,7 @@ class LayersNetConfig(NetworkConfig):
         """The network as it was published, with 1.0 million parameters; lengths at life size."""
         settings: dict[str, Any] = {
             "residual": False,
-            "base": "inertia",
+            "carried_by": "inertia",
             "heading": "world",
             "feed_forward": 256,
             "decoder": 268,

@@ -66,7 +66,7 @@ class Seen(NamedTuple):
     outfit_of_garment: torch.Tensor  # int64 [B]
 
 
-def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool, base: str) -> Seen:
+def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool, carried_by: str) -> Seen:
     """The frame in the form above.
 
     Args:
@@ -75,7 +75,7 @@ def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool
         cloth: Patches of the batch.
         fps: Frames per second.
         canonical: Whether outfits are turned to heading zero.
-        base: Where cloth goes by itself, "inertia" or "body"; the latter needs `skin`.
+        carried_by: Where cloth goes by itself, "inertia" or "body"; the latter needs `skin`.
     """
     assert inputs.previous is not None
     assert inputs.previous_body is not None
@@ -92,7 +92,7 @@ def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool
 
     turn_of_vertex = heading[of_vertex]
     garments = [_turned(part, turn_of_vertex) for part in relative]
-    if base == "body":
+    if carried_by == "body":
         assert inputs.skin is not None
         goes, about = _about(inputs.skin, x, y, turn_of_vertex)
     else:

@@ -16,8 +16,8 @@ it is in docs/layersnet.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple, cast
+from collections.abc import Sequence
+from typing import NamedTuple, cast
 
 import torch
 from torch import nn
@@ -39,7 +39,7 @@ KINDS = ("state", "attributes", "wind", "gravity")  # of tokens, in their order:
 READS = frozenset({"previous", "materials", "wind"})
 WAITS = ("cpu",)  # devices on which the number of real entries of a table is read; a GPU would have to be waited for
 STATISTICS = {"state_mean": STATE, "state_std": STATE, "acceleration_mean": 3, "acceleration_std": 3}
-STATISTICS_ABOUT = STATISTICS | {"offset_mean": ABOUT, "offset_std": ABOUT}  # with `base="body"`
+STATISTICS_ABOUT = STATISTICS | {"offset_mean": ABOUT, "offset_std": ABOUT}  # with `carried_by="body"`
 
 
 class LayersLayout(NamedTuple):
@@ -74,8 +74,11 @@ class LayersNet(GarmentNetwork):
     acceleration_std: torch.Tensor
 
     def __init__(self, config: LayersNetConfig) -> None:
+        about = config.carried_by == "body"
+        self.reads = READS | {"skin"} if about else READS
+        self.statistics = STATISTICS_ABOUT if about else STATISTICS
         super().__init__(config)
-        width, state = config.embedding, STATE + ABOUT * (config.base == "body")
+        width, state = config.embedding, STATE + ABOUT * about
         self.state = state  # numbers of the state of a garment or body
         sizes = (state, len(ATTRIBUTES), WIND, GRAVITY)
         self.encoders = nn.ModuleDict(
@@ -97,16 +100,6 @@ class LayersNet(GarmentNetwork):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
-    @property
-    def reads(self) -> frozenset[str]:
-        """Optional inputs; see `GarmentNetwork.reads`."""
-        return READS | {"skin"} if self.config.base == "body" else READS
-
-    @property
-    def statistics(self) -> Mapping[str, int]:
-        """Buffers of the normalisation and their lengths."""
-        return STATISTICS_ABOUT if self.config.base == "body" else STATISTICS
-
     def layout(self, garments: Sequence[Garment], packed: PackedGarments, *, face_splits: int = 1) -> LayersLayout:
         """The patches of a batch, and its hash grid; `face_splits` has no effect."""
         patches = [cloth_patches(garment, self.config.patch_spacing) for garment in garments]
@@ -123,7 +116,7 @@ class LayersNet(GarmentNetwork):
 
     def decoded(self, inputs: FrameInputs, layout: LayersLayout, *, bfloat16: bool = False) -> Decoded:
         """Accelerations of vertices and of patches; the arguments are those of `predict`."""
-        config, cloth = self.config, layout.cloth
+        cloth = layout.cloth
         kind = inputs.vertices.device.type
         with torch.autocast(kind, enabled=False):
             view = self._seen(inputs, cloth)
@@ -157,11 +150,13 @@ class LayersNet(GarmentNetwork):
         """States of garments and bodies together, and accelerations; see `GarmentNetwork.observed`."""
         view = self._seen(inputs, layout.cloth)
         found = {"state": torch.cat([view.vertices, view.body]), "acceleration": acceleration(view, after)}
-        return found | ({"offset": view.offsets} if self.config.base == "body" else {})
+        return found | ({"offset": view.offsets} if self.config.carried_by == "body" else {})
 
     def _seen(self, inputs: FrameInputs, cloth: ClothLayout) -> Seen:
         config = self.config
-        return seen(inputs, cloth, fps=config.fps, canonical=config.heading == "canonical", base=config.base)
+        return seen(
+            inputs, cloth, fps=config.fps, canonical=config.heading == "canonical", carried_by=config.carried_by
+        )
 
     def _normalised(self, state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
         """States [N,12] and offsets [N,6] or [N,0], in units of zero mean and unit variance, side by side."""
