@@ -165,6 +165,7 @@ class OutfitBuilder:
         ahead: Largest number of steps K of a rollout before those with a loss.
         steps: Number of steps G with a loss.
         mirror: Share of samples that are mirrored in x.
+        to_skin: Share of samples whose history lies between the recorded one and smooth skin.
     """
 
     def __init__(
@@ -175,9 +176,10 @@ class OutfitBuilder:
         ahead: int,
         steps: int,
         mirror: float = 0.0,
+        to_skin: float = 0.0,
     ) -> None:
         self.sequences, self.network, self.noise, self.ahead, self.steps = sequences, network, noise, ahead, steps
-        self.mirror = mirror
+        self.mirror, self.to_skin = mirror, to_skin
         self.device, self.subsets = sequences[0].device, False
 
     def reaches(self, sequence: int, newest: int) -> bool:
@@ -200,7 +202,7 @@ class OutfitBuilder:
         if self.mirror:
             shown = zip(mine, streams, strict=True)
             mine = [data.mirrored if stream.random() < self.mirror else data for data, stream in shown]
-        past, bodies, wind, deltas, draws, bound = [], [], [], [], [], []
+        past, bodies, wind, deltas, draws, bound, towards = [], [], [], [], [], [], []
         for (_, t), data, stream, override in zip(picks, mine, streams, overrides, strict=True):
             frames = np.arange(t - self.ahead - 2, t + self.steps + 1).clip(0)
             delta = displacement(data, history, self.noise, stream, override)
@@ -209,6 +211,7 @@ class OutfitBuilder:
             wind.append(np.repeat(data.wind[frames][:, None], len(data.garments), axis=1))
             deltas.append(np.zeros((history, *past[-1].shape[1:]), np.float32) if delta is None else delta[::-1])
             draws.append(stream.random())
+            towards.append(stream.random() if self.to_skin and stream.random() < self.to_skin else 0.0)
             start = max(t - self.ahead - 2, 0)
             early = stream.random() < FROM_FIRST
             frame = 0 if early else int(stream.integers(max(start - RECENT, 0), start + 1))
@@ -223,25 +226,36 @@ class OutfitBuilder:
             return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
         sample_of_garment = send(sample)
+        sample_of_vertex = sample_of_garment[packed.garment_of_vertex.long()]
+        frames, body, delta = (
+            torch.cat(past, dim=1),
+            send(np.concatenate(bodies, axis=1)),
+            np.concatenate(deltas, axis=1),
+        )
+        skin = bind(
+            np.concatenate([cloth for cloth, _ in bound]),
+            np.repeat(np.arange(len(mine)), [len(cloth) for cloth, _ in bound]),
+            np.concatenate([lower for _, lower in bound]),
+            packed_bodies.vertex_offsets,
+            self.device,
+        )
+        moved = send(np.concatenate(deltas, axis=1))
+        if any(towards):
+            newest, share = self.ahead + 2, send(np.array(towards, np.float32))[sample_of_vertex][:, None]
+            moved = moved + torch.stack([share * (skin(body[k])[1] - frames[k]) for k in range(newest, newest - 3, -1)])
         return OutfitBatch(
             packed=packed,
             bodies=packed_bodies,
-            skin=bind(
-                np.concatenate([cloth for cloth, _ in bound]),
-                np.repeat(np.arange(len(mine)), [len(cloth) for cloth, _ in bound]),
-                np.concatenate([body for _, body in bound]),
-                packed_bodies.vertex_offsets,
-                self.device,
-            ),
             layout=self.network.layout(garments, packed),
-            frames=torch.cat(past, dim=1),
-            body=send(np.concatenate(bodies, axis=1)),
+            frames=frames,
+            body=body,
+            skin=skin,
             wind=send(np.concatenate(wind, axis=1).astype(np.float32)),
             materials=send(np.concatenate([data.materials for data in mine])),
-            delta=send(np.concatenate(deltas, axis=1)),
+            delta=moved,
             draw=send(np.array(draws, np.float32)),
             sample_of_garment=sample_of_garment,
-            sample_of_vertex=sample_of_garment[packed.garment_of_vertex.long()],
+            sample_of_vertex=sample_of_vertex,
             steps=self.steps,
             ids=[(data.name, t) for (_, t), data in zip(picks, mine, strict=True)],
         )

@@ -54,6 +54,9 @@ class PositionConfig:
         collisions_from: Share of the run after which collisions count, from 0 to 1.
         noise: Factor of the displacements of histories (`noise`); the publication has none, and a network cannot know
             by how much a whole garment was displaced.
+        to_skin: Share of samples whose history is drawn by a random part of the way to where the garment would be as
+            smooth skin of its body (kernels/features/skin.py), with the recorded frame as target. Rollouts that have
+            lost their way look like that, and one step teaches the way back. The publication has none.
         rollout: Number of steps without gradient before those with a loss, at the end of the run. It grows evenly.
     """
 
@@ -67,6 +70,7 @@ class PositionConfig:
     reach: float = 0.03
     collisions_from: float = 0.1
     noise: float = 0.0
+    to_skin: float = 0.0
     rollout: int = 9
 
     def __post_init__(self) -> None:
@@ -74,6 +78,8 @@ class PositionConfig:
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"outfit.{field.name} must be at least 0, got {value}")
+        if self.to_skin > 1.0:
+            raise ValueError(f"outfit.to_skin is a share of samples, at most 1, got {self.to_skin}")
         if self.rollout > MOST_AHEAD:
             raise ValueError(f"outfit.rollout must be at most {MOST_AHEAD}, got {self.rollout}")
 

@@ -124,7 +124,7 @@ def make_builder(config: TrainConfig, network: GarmentNetwork, sequences: list) 
             config.noise, position=less * config.noise.position, offset=less * config.noise.offset
         )
         ahead, steps, mirror = config.outfit.rollout, config.unroll.steps, config.augmentation.mirror
-        return OutfitBuilder(sequences, network, noise, ahead, steps, mirror)
+        return OutfitBuilder(sequences, network, noise, ahead, steps, mirror, config.outfit.to_skin)
     if type(network).forward_normalised is GarmentNetwork.forward_normalised:
         raise ValueError(
             f"a {type(network).__name__} has no forward_normalised, so it is not trained on steps of faces. If it "

@@ -84,3 +84,24 @@ def test_statistics(data):
         scaled = (values - found[f"{name}_mean"]) / found[f"{name}_std"]
         assert scaled.mean(dim=0).abs().max() < 1e-3
         assert (scaled.std(dim=0) - 1).abs().max() < 1e-3 or (found[f"{name}_std"] <= 1.1e-3).any()
+
+
+def test_histories_towards_skin(data):
+    """A history would not lie between the recorded one and the skin, or the target be moved with it. 1e-6 m."""
+    network = network_of()
+    builder = builder_of(data, network, ahead=1)
+    builder.to_skin = 1.0
+    batch = builder.build([(0, 5), (1, 9)], None, np.random.default_rng(0))
+    shares = []
+    for sample in range(2):
+        mine = batch.sample_of_vertex == sample
+        for k in range(3):
+            away = (batch.skin(batch.body[3 - k])[1] - batch.frames[3 - k])[mine]
+            share = (batch.delta[k][mine] * away).sum() / away.square().sum()
+            assert (batch.delta[k][mine] - share * away).abs().max() < 1e-6
+            shares.append(float(share))
+        assert away.abs().max() > 2e-3
+    assert max(shares[:3]) - min(shares[:3]) < 1e-4  # of one sample in its three frames
+    assert all(0.0 < share < 1.0 for share in shares)
+    assert abs(shares[0] - shares[3]) > 1e-3  # of different samples
+    np.testing.assert_array_equal(batch.frames[4, : len(mine) // 2], Sequence.load(data / "a").vertices[6])
