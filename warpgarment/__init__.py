@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from warpgarment.objects.material import Material
     from warpgarment.objects.motion import GarmentMotion
     from warpgarment.objects.status import RolloutStatus, Verdict
+    from warpgarment.objects.wind import Wind
     from warpgarment.sim.simulator import Simulator
 
     from . import demo, kernels, metrics
@@ -45,6 +46,7 @@ __all__ = [
     "RolloutStatus",
     "Simulator",
     "Verdict",
+    "Wind",
     "__version__",
     "checkpoint",
     "demo",
@@ -74,6 +76,7 @@ _HOME = {
     "RolloutStatus": "objects.status",
     "Simulator": "sim.simulator",
     "Verdict": "objects.status",
+    "Wind": "objects.wind",
     "fit": "objects.fit",
 }
 _MODULES = {

@@ -180,8 +180,8 @@ class Simulator:
                 outfits, each a list of numbers of garments, innermost first, such as `[[0, 1], [2, 3, 4]]`.
             progress: Whether to show a progress bar.
             materials: Material of all garments, or a list with one, or None, for each; for networks that read them.
-            wind: Velocity of the air [m/s], shape [3], [T,3] or [T,B,3], at the network's rate; the last row holds on.
-                For networks that read it.
+            wind: A `wg.Wind`, or velocity of the air [m/s], shape [3], [T,3] or [T,B,3], at the network's rate; the
+                last row holds on. For networks that read it.
 
         Returns:
             A `GarmentMotion`, or a list of them for a list of garments.
@@ -287,7 +287,7 @@ class Simulator:
             face_splits: Number of subsets of the faces, as in `rollout`.
             layers: Which garments are worn together, as in `rollout`.
             materials: Materials, as in `rollout`.
-            wind: Velocity of the air in the first frame [m/s], shape [3], or [1,B,3] with one for each garment.
+            wind: A `wg.Wind`, or velocity of the air in the first frame [m/s], shape [3] or [1,B,3].
 
         Returns:
             The state at frame 0.
@@ -301,7 +301,7 @@ class Simulator:
         brought = self._brought(garments, single, first_vertices, None)
         first = self._positions([b.vertices[0] for b in checked])
         known_materials = as_materials(materials, len(garments), self.network, self.device)
-        worn, blown = outfits(layers, on), as_wind(wind, len(garments), self.network, one=True)
+        worn, blown = outfits(layers, on), as_wind(wind, len(garments), self.network, frame=0)
         return self._begin(brought, single, packed, [first], face_splits, worn, known_materials, [self._air(blown)])[0]
 
     def step(
@@ -312,7 +312,7 @@ class Simulator:
         Args:
             state: A state from `start` or `step`; it is not changed.
             next_body_vertices: Body in the next frame [m], shape [U,3]; a list if `start` was given one. It is copied.
-            wind: Velocity of the air in the next frame [m/s], as in `start`; None leaves it as it is.
+            wind: Wind in the next frame, as in `start` (of a `wg.Wind` its row then); None leaves it as it is.
 
         Returns:
             The next state. A garment that is not finite stays so, and its vertices are NaN.
@@ -329,7 +329,7 @@ class Simulator:
         if not all(np.isfinite(array).all() for array in arrays):
             raise MeshError(f"body_vertices of frame {state.frame + 1} hold NaN or infinity; skip or repair the frame")
         with evaluating(self.network):
-            air = as_wind(wind, len(state.scene.garments), self.network, one=True)
+            air = as_wind(wind, len(state.scene.garments), self.network, frame=state.frame + 1)
             return self._advance(state, body, self._air(air))
 
     @torch.inference_mode()
