@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from warpgarment.objects.garment import Garment
     from warpgarment.objects.material import Material
     from warpgarment.objects.motion import GarmentMotion
+    from warpgarment.objects.outfit import Outfit
     from warpgarment.objects.status import RolloutStatus, Verdict
     from warpgarment.objects.wind import Wind
     from warpgarment.sim.simulator import Simulator
@@ -42,6 +43,7 @@ __all__ = [
     "MissingExtra",
     "NetworkConfig",
     "NotEnoughMemory",
+    "Outfit",
     "PatchTransformer",
     "RolloutStatus",
     "Simulator",
@@ -72,6 +74,7 @@ _HOME = {
     "MissingExtra": "errors",
     "NetworkConfig": "nn.config",
     "NotEnoughMemory": "errors",
+    "Outfit": "objects.outfit",
     "PatchTransformer": "nn.patches.network",
     "RolloutStatus": "objects.status",
     "Simulator": "sim.simulator",

@@ -13,7 +13,7 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.material import Material
 from warpgarment.objects.wind import FASTEST, Wind, too_fast
 
-from .arguments import as_array
+from .arguments import as_array, packed_on
 
 Materials = Material | Sequence[Material | None] | None
 
@@ -87,6 +87,11 @@ def as_wind(wind: Any, count: int, network: GarmentNetwork, *, frame: int | None
     if speed.max() > FASTEST:
         raise ValueError(too_fast(speed))
     return np.array(np.broadcast_to(given, (len(given), count, 3)), np.float32)
+
+
+def air_of(wind: np.ndarray | None, frame: int, device: torch.device) -> torch.Tensor | None:
+    """The wind of a frame [m/s], shape [B,3], of the result of `as_wind`; the last one holds on."""
+    return None if wind is None else packed_on(list(wind[[min(frame, len(wind) - 1)]]), device)
 
 
 def refuse(network: GarmentNetwork, name: str) -> None:
