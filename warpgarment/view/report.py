@@ -96,15 +96,21 @@ def certified(motion: GarmentMotion) -> str:
 
     A motion of a garment that is in no outfit was not looked at, and is not free.
     """
-    uncounted = [s.frame for s in motion.status if s.layer_crossings is None or s.self_crossings is None]
     crossing = [s.frame for s in motion.status if s.layer_crossings or s.self_crossings]
-    if not motion.status or uncounted:
-        first = f" (first: frame {uncounted[0]})" if uncounted else ""
-        return f"not counted in {len(uncounted) or motion.frames:,} of {motion.frames:,} frames{first}"
+    uncounted = [s.frame for s in motion.status if s.layer_crossings is None or s.self_crossings is None]
+    failed = [s.frame for s in motion.status if not s.finite]
+    if not motion.status:
+        return "not counted"
+    if failed:
+        return f"not finite from frame {failed[0]} on"
     if crossing:
         pairs = max((s.layer_crossings or 0) + (s.self_crossings or 0) for s in motion.status)
-        return f"in {len(crossing):,} of {motion.frames:,} frames (first: frame {crossing[0]}), {pairs:,} pairs at most"
-    return ""
+        return f"crosses in {_frames(crossing, motion)}, {pairs:,} pairs at most"
+    return f"not counted in {_frames(uncounted, motion)}" if uncounted else ""
+
+
+def _frames(found: Sequence[int], motion: GarmentMotion) -> str:
+    return f"{len(found):,} of {motion.frames:,} frames (first: frame {found[0]})"
 
 
 def deepest(motion: GarmentMotion) -> float:
