@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def make(out: Path) -> None:
     walk = read_npz(ASSETS / "body.npz", ("bone_transforms", "fps"))
     transforms = walk["bone_transforms"]
     first = transforms[0, 0].astype(np.float64)
-    arrays = {
+    arrays: dict[str, Any] = {
         "names": np.array([pattern.category for pattern in plan.outfit.layers]),
         "wind": plan.wind.velocities(len(transforms), float(walk["fps"])),
     }

@@ -47,7 +47,7 @@ class Material:
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
             least = 0.0 if name in ("bend", "damping", "friction") else 1e-9
-            if not isinstance(value, Real) or not (math.isfinite(value) and value >= least):
+            if not isinstance(value, Real) or not (math.isfinite(value) and float(value) >= least):
                 raise UsageError(
                     f"a material's {name} must be {'positive' if least else 'at least 0'}, got {value}. Give "
                     f"{EXAMPLES[name]}"

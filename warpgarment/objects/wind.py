@@ -126,7 +126,7 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     except (TypeError, ValueError):
         raise UsageError(f"a wind's {name} must be numbers, got {value!r}") from None
     if not np.isfinite(found).all():
-        rows = ~np.isfinite(found.reshape(len(found) if found.ndim else 1, -1)).all(axis=1)
+        rows = np.logical_not(np.isfinite(np.atleast_2d(found.T).T).all(axis=-1)).reshape(-1)
         raise UsageError(f"a wind's {name} holds NaN or infinity{_at(rows)}. Repair what it is from")
     return found
 
