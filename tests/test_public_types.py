@@ -17,9 +17,20 @@ SEVERAL = SimulationState[list[np.ndarray], list[wg.RolloutStatus]]
 
 @pytest.mark.skipif(not hasattr(typing, "get_overloads"), reason="Python 3.10 does not keep overloads")
 @pytest.mark.parametrize(
-    ("method", "one", "several"), [("rollout", wg.GarmentMotion, list[wg.GarmentMotion]), ("start", ONE, SEVERAL)]
+    ("method", "kinds"),
+    [
+        (
+            "rollout",
+            {
+                wg.Garment: wg.GarmentMotion,
+                Sequence[wg.Garment]: list[wg.GarmentMotion],
+                Sequence[wg.Outfit]: list[list[wg.GarmentMotion]],
+            },
+        ),
+        ("start", {wg.Garment: ONE, Sequence[wg.Garment]: SEVERAL}),
+    ],
 )
-def test_overloads_tell_one_from_several(method, one, several):
+def test_overloads_tell_one_from_several(method, kinds):
     """An editor takes the result for anything, or a list for a single motion; other arguments must be those of the
     method itself."""
     function = getattr(wg.Simulator, method)
@@ -30,7 +41,13 @@ def test_overloads_tell_one_from_several(method, one, several):
         returned[hints.pop("garment")] = hints.pop("return")
         assert hints == {name: kind for name, kind in own.items() if name not in ("garment", "return")}
         assert overload.__kwdefaults__ == function.__kwdefaults__
-    assert returned == {wg.Garment: one, Sequence[wg.Garment]: several}
+    assert returned == kinds
+
+
+def test_an_outfit_is_a_sequence_of_garments():
+    """An editor would take an outfit for no argument of `rollout`, or its result for anything."""
+    assert issubclass(wg.Outfit, Sequence)
+    assert wg.Outfit.__orig_bases__ == (Sequence[wg.Garment],)
 
 
 def test_a_step_gives_what_it_was_given():

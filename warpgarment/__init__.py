@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from warpgarment.objects.garment import Garment
     from warpgarment.objects.material import Material
     from warpgarment.objects.motion import GarmentMotion
+    from warpgarment.objects.outfit import Outfit
     from warpgarment.objects.status import RolloutStatus, Verdict
+    from warpgarment.objects.wind import Wind
     from warpgarment.sim.simulator import Simulator
 
     from . import demo, kernels, metrics
@@ -41,10 +43,12 @@ __all__ = [
     "MissingExtra",
     "NetworkConfig",
     "NotEnoughMemory",
+    "Outfit",
     "PatchTransformer",
     "RolloutStatus",
     "Simulator",
     "Verdict",
+    "Wind",
     "__version__",
     "checkpoint",
     "demo",
@@ -70,10 +74,12 @@ _HOME = {
     "MissingExtra": "errors",
     "NetworkConfig": "nn.config",
     "NotEnoughMemory": "errors",
+    "Outfit": "objects.outfit",
     "PatchTransformer": "nn.patches.network",
     "RolloutStatus": "objects.status",
     "Simulator": "sim.simulator",
     "Verdict": "objects.status",
+    "Wind": "objects.wind",
     "fit": "objects.fit",
 }
 _MODULES = {

@@ -6,8 +6,11 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+from support.outfits import layersnet
 from support.runs import entries_of
 
+import warpgarment as wg
+from warpgarment.nn import checkpoint
 from warpgarment.objects.motion import GarmentMotion
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -70,3 +73,27 @@ def test_train_on_own_data(tmp_path, capsys) -> None:
     printed = capsys.readouterr().out
     assert f"loss {losses[-1]:.3f}" in printed
     assert np.isfinite(float(printed.split(" cm from the truth")[0].split()[-1]))
+
+
+def test_layered_outfit_in_the_wind(tmp_path, capsys) -> None:
+    """Layers of the example cross, or are not counted; or a network that reads wind gets none: another motion."""
+    _run("06_layered_outfit_in_the_wind", out=tmp_path / "still", frames=4)
+    printed = capsys.readouterr().out
+    assert "this network reads neither materials nor wind" in printed
+    for name in ("dress", "jacket"):
+        assert f"{name:8} 4 frames, 4 of them counted, 0 with crossing triangles, held back by up to " in printed
+    assert {p.name for p in (tmp_path / "still").iterdir()} == {
+        *("outfit.png", "dress.pc2", "dress.obj", "jacket.pc2", "jacket.obj")
+    }
+    checkpoint.save(layersnet(), tmp_path / "windy.safetensors")
+    _run("06_layered_outfit_in_the_wind", out=tmp_path / "windy", frames=3, weights=tmp_path / "windy.safetensors")
+    assert "reads neither" not in capsys.readouterr().out
+    assets = wg.demo.assets()
+    assert assets.outfit is not None
+    outfit = wg.Outfit(assets.outfit.outfit.garments, [wg.Material.cotton(), wg.Material.denim()])
+    still = wg.Simulator.from_pretrained(tmp_path / "windy.safetensors").rollout(
+        outfit, assets.collider, first_vertices=assets.outfit.first_vertices, frames=3
+    )
+    for motion in still:
+        found = GarmentMotion.load(tmp_path / "windy" / f"{motion.name}.pc2", fps=30.0)
+        assert np.abs(found.vertices[1:] - motion.vertices[1:]).max() > 1e-5

@@ -16,6 +16,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import VertexStep
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.material import Material
+from warpgarment.objects.wind import Wind
 from warpgarment.sim.simulator import Simulator
 
 SPEED = torch.tensor([0.003, -0.004, 0.002])  # metres a frame
@@ -182,6 +183,25 @@ def test_earlier_frames_materials_and_wind(live):
         assert seen.materials[0].isnan().all()
         assert seen.materials[1].tolist() == pytest.approx(list(vars(Material(density=0.3)).values()))
         assert seen.bodies.body_of_garment.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_wind_of_a_shot(live):
+    """`wg.Wind` would blow at other times than an array of its velocities at the network's rate, 30 a second; or `step`
+    would take its first row for all. Of 15 rows a second, every second frame is a row; 1e-6 m/s."""
+    network, motion = drift(Witness), walk(5)
+    simulator = Simulator(network, "cpu", collision_passes=0)
+    wind = Wind([0, 0, 3], [0, 4, 2], fps=15)
+    if live:
+        state = simulator.start([skirt(), skirt()], motion.vertices[0], motion.faces, wind=wind)
+        for t in range(1, 5):
+            state = simulator.step(state, motion.vertices[t], wind=wind)
+    else:
+        simulator.rollout([skirt(), skirt()], motion, wind=wind)
+    expected = np.zeros((5, 2, 3))
+    expected[:, :, 2] = np.array([0, 2, 4, 3, 2])[:, None]
+    for t, seen in enumerate(network.seen):
+        np.testing.assert_allclose(seen.wind.numpy(), [expected[t + 1], expected[t]], atol=1e-6)
 
 
 def test_wind_holds_on_after_a_history():

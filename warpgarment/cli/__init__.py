@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from warpgarment.errors import MeshError
 
 _ROOM = "warpgarment"
+NOT_FREE = 3  # exit status where a result was written that is not free of crossings
 _EXTRAS = {
     "newton": "physics",
     "gpytoolbox": "physics",
@@ -48,7 +49,9 @@ VERBS = {
     "demo": Verb(
         "cli.demo", "Demo", "run", "Roll out the bundled garments on the bundled body; film, USD and figures."
     ),
-    "simulate": Verb("cli.simulate", "Simulate", "run", "Dress a moving body: garment file, body motion, output file."),
+    "simulate": Verb(
+        "cli.simulate", "Simulate", "run", "Dress a moving body: garment files, body motion, output file."
+    ),
     "generate": Verb(
         "training.generate.run", "GenerateConfig", "generate", "Simulate training sequences with a physics teacher."
     ),
@@ -90,7 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit status: 0; 2 where the user has to change something, which one line on stderr names; 1 for a fault of
-        the program, where the line says in which file its traceback is kept.
+        the program, where the line says in which file its traceback is kept; 3 where a result was written, and garments
+        that should not cross do, or were not all looked at.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
@@ -108,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verb = VERBS[name]
     try:
         options = _options(verb, name, arguments[1:])
-        getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.function)(options)
+        status = getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.function)(options)
     except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
         return _complain(f"{type(error).__name__}: {error}")
     except ModuleNotFoundError as error:
@@ -124,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not type(error).__module__.startswith(_ROOM):
             return _own_up(error)  # not one of the errors that name a remedy
         return _complain(f"{type(error).__name__}: {error}")
-    return 0
+    return status if type(status) is int else 0
 
 
 @contextlib.contextmanager

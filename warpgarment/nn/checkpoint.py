@@ -159,7 +159,7 @@ def find(name: str | os.PathLike[str], *, device: torch.device | str | None = No
     """
     if Path(name).exists():
         return shards.locate(name)
-    ships = _shipped()
+    ships = shipped()
     wanted = os.fspath(name)
     if wanted == "default":
         wanted = _default(ships, device)
@@ -176,7 +176,7 @@ def find(name: str | os.PathLike[str], *, device: torch.device | str | None = No
         raise CheckpointError(f"{wanted} on the Hugging Face Hub holds no network: {error}") from error
 
 
-def _shipped() -> dict[str, Path]:
+def shipped() -> dict[str, Path]:
     """Networks that ship with the package, by name: files, and folders of shards."""
     files = {file.stem: file for file in WEIGHTS.glob("*.safetensors")}
     return files | {index.parent.name: index.parent for index in WEIGHTS.glob(f"*/{shards.INDEX}")}

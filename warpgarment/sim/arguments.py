@@ -22,6 +22,15 @@ def as_array(values: Any) -> np.ndarray:
     return np.array(values, dtype=np.float32)
 
 
+def packed_on(arrays: Sequence[np.ndarray], device: torch.device) -> torch.Tensor:
+    """Arrays [*,3] end to end on a device; always a copy, so that callers may reuse their arrays.
+
+    Copies to a GPU start from pinned memory; with other memory the host would wait for all earlier work.
+    """
+    packed = torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False))
+    return packed.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else packed
+
+
 def listed(value: Any, kind: type) -> tuple[list, bool]:
     """Returns the argument as a list, and whether a single object was given.
 
@@ -190,3 +199,24 @@ def given_bodies(vertices: Any, faces: Any, count: int, fps: float) -> tuple[lis
     else:
         vertices, faces, on = [vertices], [faces], [0] * count
     return [BodyMotion(as_array(v)[None], f, fps) for v, f in zip(vertices, faces, strict=True)], on
+
+
+def next_bodies(vertices: Any, count: int, frame: int) -> list[np.ndarray]:
+    """Bodies of the next frame [m], each float32 [U,3].
+
+    Args:
+        vertices: Positions of one body, or a list of them.
+        count: Number of vertices of all bodies at the start.
+        frame: Number of the frame, for messages.
+
+    Raises:
+        ValueError: The number of vertices is another one.
+        MeshError: Positions are not finite.
+    """
+    arrays = [as_array(v) for v in (vertices if isinstance(vertices, (list, tuple)) else [vertices])]
+    found = sum(len(array) for array in arrays)
+    if found != count or any(array.shape[1:] != (3,) for array in arrays):
+        raise ValueError(f"bodies had {count} vertices at the start, now there are {found}")
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise MeshError(f"body_vertices of frame {frame} hold NaN or infinity; skip or repair the frame")
+    return arrays

@@ -11,10 +11,10 @@ import torch
 
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.material import Material
+from warpgarment.objects.wind import FASTEST, Wind, too_fast
 
-from .arguments import as_array
+from .arguments import as_array, packed_on
 
-FASTEST = 100.0  # m/s; faster air than in any storm is a mistake of unit
 Materials = Material | Sequence[Material | None] | None
 
 
@@ -50,14 +50,14 @@ def as_materials(
     return torch.tensor(rows, dtype=torch.float32, device=device)
 
 
-def as_wind(wind: Any, count: int, network: GarmentNetwork, *, one: bool = False) -> np.ndarray | None:
+def as_wind(wind: Any, count: int, network: GarmentNetwork, *, frame: int | None = None) -> np.ndarray | None:
     """Wind as an array.
 
     Args:
-        wind: Velocity of the air [m/s], shape [3], [T,3], or [T,B,3] with one for each garment; or None.
+        wind: A `Wind`; or velocity of the air [m/s], shape [3], [T,3], or [T,B,3] with one for each garment; or None.
         count: Number of garments B.
         network: The network that is to read it.
-        one: Whether it is the wind of one frame.
+        frame: Number of the only frame that is wanted, of which an array then has to be; None for all frames.
 
     Returns:
         Velocities [m/s], float32 [T,B,3]; None if None is given.
@@ -69,20 +69,29 @@ def as_wind(wind: Any, count: int, network: GarmentNetwork, *, one: bool = False
     if wind is None:
         return None
     refuse(network, "wind")
+    if isinstance(wind, Wind):
+        blown = wind.velocities(network.config.fps)[:, None]
+        blown = blown if frame is None else blown[[min(frame, len(blown) - 1)]]
+        return np.repeat(blown, count, axis=1)
     given = as_array(wind)
     shape, given = given.shape, given[None] if given.ndim == 1 else given
     if given.ndim == 2:
         given = given[:, None]
     if given.ndim != 3 or not len(given) or given.shape[1] not in (1, count) or given.shape[2] != 3:
         raise ValueError(f"wind must have shape [3], [T,3] or [T,{count},3], got {list(shape)}")
-    if one and len(given) != 1:
+    if frame is not None and len(given) != 1:
         raise ValueError(f"wind of one frame must have shape [3] or [1,{count},3], got {len(given)} frames")
     speed = np.linalg.norm(given, axis=-1)
     if not np.isfinite(given).all():
         raise ValueError(f"wind holds NaN or infinity (first: frame {int(np.argwhere(~np.isfinite(speed))[0, 0])})")
     if speed.max() > FASTEST:
-        raise ValueError(f"wind of {speed.max():,.0f} m/s; it must be at most {FASTEST:.0f} m/s. Check its unit")
+        raise ValueError(too_fast(speed))
     return np.array(np.broadcast_to(given, (len(given), count, 3)), np.float32)
+
+
+def air_of(wind: np.ndarray | None, frame: int, device: torch.device) -> torch.Tensor | None:
+    """The wind of a frame [m/s], shape [B,3], of the result of `as_wind`; the last one holds on."""
+    return None if wind is None else packed_on(list(wind[[min(frame, len(wind) - 1)]]), device)
 
 
 def refuse(network: GarmentNetwork, name: str) -> None:

@@ -13,7 +13,7 @@ from typing import Any, overload
 import numpy as np
 import torch
 
-from warpgarment.errors import MeshError, UsageError
+from warpgarment.errors import UsageError
 from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.nn import checkpoint
@@ -23,20 +23,23 @@ from warpgarment.nn.run import evaluating
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
+from warpgarment.objects.outfit import Outfit
 from warpgarment.objects.pack import PackedBodies
 from warpgarment.objects.status import RolloutStatus
 from warpgarment.sim.stages.correct import Corrector
 
 from .advance import advance
-from .arguments import Layers, as_array, counted, given_bodies, known_frames, listed, outfits, per_garment
+from .arguments import Layers, counted, given_bodies, known_frames, next_bodies, outfits, packed_on, per_garment
 from .brought import Brought
 from .graph import GraphedFrames
-from .outdoors import Materials, as_materials, as_wind
+from .outdoors import Materials, air_of, as_materials, as_wind
 from .results.recording import READ_EVERY, Recording, seen
 from .results.shot import Rate, bodies_of_shot, brought_to_shot, frames_needed, rates_of
 from .scene import Scene
 from .state import SimulationState, Status, Vertices, starting_states
 from .timing import Timings
+from .worn.given import numbered, unfolded
+from .worn.order import warn_of_wrong_order
 
 
 class Simulator:
@@ -135,9 +138,10 @@ class Simulator:
         wind: Any = None,
     ) -> list[GarmentMotion]: ...
 
+    @overload
     def rollout(
         self,
-        garment: Garment | Sequence[Garment],
+        garment: Sequence[Outfit],
         body: BodyMotion | Sequence[BodyMotion],
         *,
         first_vertices: Any = None,
@@ -149,7 +153,23 @@ class Simulator:
         progress: bool = False,
         materials: Materials = None,
         wind: Any = None,
-    ) -> GarmentMotion | list[GarmentMotion]:
+    ) -> list[list[GarmentMotion]]: ...
+
+    def rollout(
+        self,
+        garment: Garment | Sequence[Garment] | Sequence[Outfit],
+        body: BodyMotion | Sequence[BodyMotion],
+        *,
+        first_vertices: Any = None,
+        history: Any = None,
+        frames: int | None = None,
+        out_fps: Rate = None,
+        face_splits: int = 1,
+        layers: Layers = None,
+        progress: bool = False,
+        materials: Materials = None,
+        wind: Any = None,
+    ) -> GarmentMotion | list[GarmentMotion] | list[list[GarmentMotion]]:
         """Simulates garments over motions of their bodies, as one batch.
 
         Frame 0 is the garment as given: draped on the body's first frame, at rest. Bodies are resampled to the
@@ -162,8 +182,8 @@ class Simulator:
         It may depend on the number of threads in the last bit, which can grow to a millimetre: docs/rounding.md.
 
         Args:
-            garment: One garment, or a list.
-            body: One body for all garments, or a list with one for each garment (the same object may repeat).
+            garment: One garment, a list, an `Outfit`, or a list of outfits.
+            body: One body for all, or a list with one for each garment, or for each of several outfits; it may repeat.
             first_vertices: Positions in the first frame [m], shape [V,3] (or a list), where they differ from the rest
                 positions `garment.vertices`: see `wg.fit`.
             history: Known first frames, shape [H,V,3] (or a list) with H the network's `history`, of the body's first H
@@ -180,11 +200,11 @@ class Simulator:
                 outfits, each a list of numbers of garments, innermost first, such as `[[0, 1], [2, 3, 4]]`.
             progress: Whether to show a progress bar.
             materials: Material of all garments, or a list with one, or None, for each; for networks that read them.
-            wind: Velocity of the air [m/s], shape [3], [T,3] or [T,B,3], at the network's rate; the last row holds on.
-                For networks that read it.
+            wind: A `wg.Wind`, or velocity of the air [m/s], shape [3], [T,3] or [T,B,3], at the network's rate; the
+                last row holds on. For networks that read it.
 
         Returns:
-            A `GarmentMotion`, or a list of them for a list of garments.
+            A `GarmentMotion`; a list for several garments or an outfit; for outfits, a list for each; so of `history`.
 
         Raises:
             ValueError: Lists have different lengths, arrays have other shapes, both `first_vertices` and `history`
@@ -194,48 +214,44 @@ class Simulator:
             NotEnoughMemory: The batch would not fit on the device; the message names settings with which it would.
             UsageError: `frames` is less than 1.
         """
-        garments, single = listed(garment, Garment)
-        bodies = per_garment(body, BodyMotion, len(garments), "bodies")
-        unique = list({id(b): b for b in bodies}.values())
-        number = {id(b): i for i, b in enumerate(unique)}
+        told = unfolded(garment, body, layers, materials, first_vertices, history)
+        garments, single = told.garments, told.single
+        unique, on = numbered(per_garment(told.body, BodyMotion, len(garments), "bodies"))
         if frames is not None and frames < 1:
             raise UsageError(f"frames must be at least 1, got {frames}")
         fps = self.network.config.fps
         rates = rates_of(unique, out_fps, fps)
         needed = [frames_needed(frames, rate, fps) for rate in rates]
         motions = [b.resampled(fps, count) for b, count in zip(unique, needed, strict=True)]
-        brought = self._brought(garments, single, first_vertices, history)
+        brought = self._brought(garments, single, *told.starts)
         given = len(brought.known)
-        on = [number[id(b)] for b in bodies]
         shot = bodies_of_shot(unique, rates, frames, garments, on) if any(rate != fps for rate in rates) else None
         lengths = [min(motions[i].frames, needed[i] or 2**62) for i in on]
         if min(lengths) < given:
             raise ValueError(f"history has {given} frames, the shortest motion (or frames=) {min(lengths)}")
 
         def body_at(frame: int) -> torch.Tensor:
-            return self._positions([m.vertices[min(frame, m.frames - 1)] for m in motions])
+            return packed_on([m.vertices[min(frame, m.frames - 1)] for m in motions], self.device)
 
-        sizes = [m.vertices.shape[1] for m in motions]
-        packed = PackedBodies.pack([m.faces for m in motions], sizes, on, self.device)
+        packed = PackedBodies.pack([m.faces for m in motions], [m.vertices.shape[1] for m in motions], on, self.device)
         first = [body_at(frame) for frame in range(given)]
-        known_materials = as_materials(materials, len(garments), self.network, self.device)
-        blown = as_wind(wind, len(garments), self.network)
-        blowing = [self._air(blown, frame) for frame in range(given)]
-        worn = outfits(layers, on)
-        states = self._begin(brought, single, packed, first, face_splits, worn, known_materials, blowing)
+        known_materials = as_materials(told.materials, len(garments), self.network, self.device)
+        blown, worn = as_wind(wind, len(garments), self.network), outfits(told.layers, on)
+        blowing = [air_of(blown, frame, self.device) for frame in range(max(lengths))]
+        states = self._begin(brought, single, packed, first, face_splits, worn, known_materials, blowing[:given])
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         with evaluating(self.network):
             for frame in counted(range(total), progress):
                 known = frame < given
-                state = states[frame] if known else self._advance(state, body_at(frame), self._air(blown, frame))
+                state = states[frame] if known else self._advance(state, body_at(frame), blowing[frame])
                 if not recording.add(seen(state.scene, state.now.outcome, state.now.body), last=frame == total - 1):
                     break
         returned = brought.given if history is not None else None
         results = recording.motions(garments, [motions[i].clock for i in on], fps, returned)
         if shot is not None:
             results = brought_to_shot(states[0].scene, results, on, shot, motions, rates, frames)
-        return results[0] if single else results
+        return told.folded(results)
 
     @overload
     def start(
@@ -280,14 +296,14 @@ class Simulator:
         """Starts a simulation on a body whose motion is not known yet; call `step` once per frame of `config.fps`.
 
         Args:
-            garment: One garment, or a list.
+            garment: One garment, a list, or an `Outfit`.
             body_vertices: Body in the first frame [m], shape [U,3], for all garments; or a list with one for each.
             body_faces: Vertex indices of its faces, shape [G,3]; a list if `body_vertices` is one.
             first_vertices: Positions in the first frame, as in `rollout`.
             face_splits: Number of subsets of the faces, as in `rollout`.
             layers: Which garments are worn together, as in `rollout`.
             materials: Materials, as in `rollout`.
-            wind: Velocity of the air in the first frame [m/s], shape [3], or [1,B,3] with one for each garment.
+            wind: A `wg.Wind`, or velocity of the air in the first frame [m/s], shape [3] or [1,B,3].
 
         Returns:
             The state at frame 0.
@@ -295,14 +311,16 @@ class Simulator:
         Raises:
             ValueError, MeshError, NotEnoughMemory: As for `rollout`.
         """
-        garments, single = listed(garment, Garment)
+        told = unfolded(garment, None, layers, materials, first_vertices, None)
+        garments, single = told.garments, told.single
         checked, on = given_bodies(body_vertices, body_faces, len(garments), self.network.config.fps)
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
-        brought = self._brought(garments, single, first_vertices, None)
-        first = self._positions([b.vertices[0] for b in checked])
-        known_materials = as_materials(materials, len(garments), self.network, self.device)
-        worn, blown = outfits(layers, on), as_wind(wind, len(garments), self.network, one=True)
-        return self._begin(brought, single, packed, [first], face_splits, worn, known_materials, [self._air(blown)])[0]
+        brought = self._brought(garments, single, *told.starts)
+        first = packed_on([b.vertices[0] for b in checked], self.device)
+        known_materials = as_materials(told.materials, len(garments), self.network, self.device)
+        air, worn = as_wind(wind, len(garments), self.network, frame=0), outfits(told.layers, on)
+        blown = [air_of(air, 0, self.device)]
+        return self._begin(brought, single, packed, [first], face_splits, worn, known_materials, blown)[0]
 
     def step(
         self, state: SimulationState[Vertices, Status], next_body_vertices: Any, *, wind: Any = None
@@ -312,7 +330,7 @@ class Simulator:
         Args:
             state: A state from `start` or `step`; it is not changed.
             next_body_vertices: Body in the next frame [m], shape [U,3]; a list if `start` was given one. It is copied.
-            wind: Velocity of the air in the next frame [m/s], as in `start`; None leaves it as it is.
+            wind: Wind in the next frame, as in `start` (of a `wg.Wind` its row then); None leaves it as it is.
 
         Returns:
             The next state. A garment that is not finite stays so, and its vertices are NaN.
@@ -321,16 +339,10 @@ class Simulator:
             ValueError: The number of bodies or of their vertices differs from that at the start.
             MeshError: Positions are not finite.
         """
-        listed = isinstance(next_body_vertices, (list, tuple))
-        arrays = [as_array(v) for v in (next_body_vertices if listed else [next_body_vertices])]
-        body = self._positions(arrays)
-        if body.shape != state.now.body.shape:
-            raise ValueError(f"bodies had {len(state.now.body)} vertices at the start, now there are {len(body)}")
-        if not all(np.isfinite(array).all() for array in arrays):
-            raise MeshError(f"body_vertices of frame {state.frame + 1} hold NaN or infinity; skip or repair the frame")
+        arrays = next_bodies(next_body_vertices, len(state.now.body), state.frame + 1)
         with evaluating(self.network):
-            air = as_wind(wind, len(state.scene.garments), self.network, one=True)
-            return self._advance(state, body, self._air(air))
+            air = as_wind(wind, len(state.scene.garments), self.network, frame=state.frame + 1)
+            return self._advance(state, packed_on(arrays, self.device), air_of(air, 0, self.device))
 
     @torch.inference_mode()
     def _begin(
@@ -370,6 +382,7 @@ class Simulator:
             layers=layers,
             materials=materials,
         )
+        warn_of_wrong_order(scene, known[0], body_frames[0], layers)
         return starting_states(scene, single, known, body_frames, wind, GraphedFrames(scene) if self.graph else None)
 
     @torch.inference_mode()
@@ -385,15 +398,3 @@ class Simulator:
 
     def _brought(self, garments: list[Garment], single: bool, first: Any, history: Any) -> Brought:
         return Brought(garments, known_frames(garments, single, first, history, self.network.config.history))
-
-    def _air(self, wind: np.ndarray | None, frame: int = 0) -> torch.Tensor | None:
-        """A frame of the result of `as_wind`, [B,3]; the last one holds on."""
-        return None if wind is None else self._positions(list(wind[[min(frame, len(wind) - 1)]]))
-
-    def _positions(self, arrays: Sequence[np.ndarray]) -> torch.Tensor:
-        """Concatenates arrays [*,3] on the device; always a copy, so that callers may reuse their arrays.
-
-        Copies to a GPU start from pinned memory; with other memory the host would wait for all earlier work.
-        """
-        packed = torch.from_numpy(np.concatenate(arrays).astype(np.float32, copy=False))
-        return packed.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else packed
