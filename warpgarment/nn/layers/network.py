@@ -17,11 +17,12 @@ it is in docs/layersnet.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import nn
 
+from warpgarment.kernels.features.outdoor import ATTRIBUTES
 from warpgarment.kernels.neighbours import NearestPoints
 from warpgarment.nn.inputs import FrameInputs, VertexStep
 from warpgarment.nn.network import GarmentNetwork
@@ -31,7 +32,7 @@ from warpgarment.objects.pack import PackedGarments
 from .block import Block, Edges, Links, Tokens
 from .cloth import ClothLayout, cloth_layout, cloth_patches
 from .config import BODY, VERTEX_PATCHES, LayersNetConfig
-from .inputs import ATTRIBUTES, Seen, acceleration, moved, positions, seen
+from .inputs import Seen, acceleration, moved, positions, seen
 from .turns import Bases, frames, turned
 
 STATE, GRAVITY, WIND = 12, 6, 22
@@ -62,8 +63,8 @@ class LayersNet(GarmentNetwork):
         config: Settings of the network.
     """
 
-    reads: ClassVar[frozenset[str]] = frozenset({"previous", "materials", "wind"})
-    statistics: ClassVar[Mapping[str, int]] = STATISTICS
+    reads: frozenset[str] = frozenset({"previous", "materials", "wind"})
+    statistics: Mapping[str, int] = STATISTICS
     config: LayersNetConfig
 
     state_mean: torch.Tensor
