@@ -13,6 +13,7 @@ import pytest
 import torch
 from support import sequences
 from support.runs import config_for, entries_of
+from support.sequences import two_layers
 
 from warpgarment.errors import MeshError
 from warpgarment.nn import checkpoint
@@ -40,20 +41,6 @@ SMALL = {"embedding": 32, "layers": 1, "feed_forward": 32, "heads": 4, "world_he
 SMALL |= {"patch_spacing": 0.1, "patch_radius": 0.1, "body_radius": 0.15}
 QUIET = NoiseConfig(position=0.0, offset=0.0)
 SHAPE = tuple(f"{name}={value}" for name, value in SMALL.items())
-
-
-def two_layers(content: dict) -> None:
-    """Makes an outfit of the tube and a wider one over it, in a wind."""
-    count = len(content["garment_rest_vertices"])
-    for name in ("garment_rest_vertices", "garment_vertices"):
-        inner = content[name]
-        middle = inner.mean(axis=-2, keepdims=True)
-        content[name] = np.concatenate([inner, middle + (inner - middle) * [1.2, 0.9, 1.2]], axis=-2).astype(np.float32)
-    faces = content["garment_faces"]
-    content["garment_faces"] = np.concatenate([faces, faces + count]).astype(np.int32)
-    content["garment_starts"] = np.array([0, count, 2 * count], np.int32)
-    frames = len(content["garment_vertices"])
-    content["wind"] = np.stack([np.linspace(0, 2, frames), np.zeros(frames), np.ones(frames)], 1).astype(np.float32)
 
 
 MATERIAL = Material(density=0.4, bend=1e-4)
