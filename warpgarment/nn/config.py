@@ -61,9 +61,7 @@ class NetworkConfig:
     face_feed_forward: int = 128
     face_layers: int = 2  # number of face layers after the patches; there is one more before them
     channels: tuple[str, ...] = CHANNELS  # features of a face that the network reads, see kernels/features/channels.py
-    outdoor: tuple[
-        str, ...
-    ] = ()  # channels of material and wind that it reads too: kernels/features/outdoor.py
+    outdoor: tuple[str, ...] = ()  # channels of material and wind that it reads too: kernels/features/outdoor.py
 
     def __post_init__(self) -> None:
         for name in ("embedding", "layers", "feed_forward", "heads", "face_embedding", "face_feed_forward"):
