@@ -129,7 +129,7 @@ def windy(network: ManifoldAwareTransformer) -> ManifoldAwareTransformer:
     """The network with the wind relative to each face as one more input, on which it depends as on the others."""
     made = added(network, ("wind",))
     torch.nn.init.normal_(made.embed_faces.weight[:, -3:], std=0.3)
-    made.set_statistics({"outdoor_std": [0.5] * 3})
+    made.set_statistics({"outdoor_std": [0.05] * 3})
     return made
 
 
