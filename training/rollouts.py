@@ -134,9 +134,11 @@ def predict(
         raise ValueError(f"a warm start needs {history} recorded frames; up to frame {newest} there are {newest + 1}")
     check_rate(body.fps, simulator.network.config.fps)
     part = BodyMotion(body.vertices[first : newest + steps + 1], body.faces, body.fps)
+    reads = simulator.network.reads & {"materials", "wind"}
     with warnings.catch_warnings():  # a rollout that fails is visible in the figures
         warnings.simplefilter("ignore", RuntimeWarning)
-        if simulator.network.reads & {"materials", "wind"}:
+        worn = getattr(sequence, "layers", ())
+        if len(worn) > 1 or (worn and reads):  # each garment by itself, as in other simulations
             moved = _outfit(simulator, cast(RecordedOutfit, sequence), part, first, start, known)
         else:
             moved = simulator.rollout(sequence.garment, part, first_vertices=start, history=known).vertices
@@ -154,19 +156,21 @@ def _outfit(
     start: np.ndarray | None,
     known: np.ndarray | None,
 ) -> np.ndarray:
-    """Rolls an outfit out garment by garment, with its materials and wind; the arguments are those of `predict`.
+    """Rolls an outfit out garment by garment, with its materials and wind if the network reads them; the arguments are
+    those of `predict`.
 
     Returns:
         Vertices [m], float32 [T,V,3]; a garment that has stopped is NaN.
     """
     parts = [layer.vertices for layer in sequence.layers]
+    reads, wind = simulator.network.reads, sequence.wind
     motions = simulator.rollout(
         list(sequence.worn),
         body,
         first_vertices=None if start is None else [start[part] for part in parts],
         history=None if known is None else [known[:, part] for part in parts],
-        materials=list(sequence.materials),
-        wind=None if sequence.wind is None else sequence.wind[first : first + len(body.vertices)],
+        materials=list(sequence.materials) if "materials" in reads else None,
+        wind=None if wind is None or "wind" not in reads else wind[first : first + len(body.vertices)],
     )
     moved = np.full((body.frames, len(sequence.garment.vertices), 3), np.nan, np.float32)
     for part, motion in zip(parts, motions, strict=True):

@@ -189,4 +189,16 @@ INTERACTION = Layout(
 )
 """Channels of a stored `BodyInteraction`: all its fields except the index of the body face."""
 
+OUTDOOR = Layout(
+    (
+        Channel("density", 1, Kind.SCALAR),
+        Channel("stretch", 1, Kind.SCALAR),
+        Channel("shear", 1, Kind.SCALAR),
+        Channel("bend", 1, Kind.SCALAR),
+        Channel("friction", 1, Kind.SCALAR),
+        Channel("wind", 3, Kind.VECTOR, length=True),
+    )
+)
+"""Channels of a face for its cloth and the air about it, which no kernel writes; outdoor.py defines each."""
+
 FEATURES, LAYOUT = FACE.width, FACE.slices

@@ -11,6 +11,7 @@ import torch
 
 from support import sequences
 from support.scenes import tube, walk
+from support.sequences import two_layers
 from warpgarment.kernels.features.skin import Skin, bind
 from warpgarment.nn.inputs import FrameInputs
 from warpgarment.nn.layers.config import LayersNetConfig
@@ -153,20 +154,6 @@ def turned_motion(motion: BodyMotion, rotation: np.ndarray, shift: np.ndarray) -
     return BodyMotion(
         motion.vertices @ rotation.T.astype(np.float32) + shift.astype(np.float32), motion.faces, motion.fps
     )
-
-
-def two_layers(content: dict) -> None:
-    """Makes an outfit of the tube and a wider one over it, in a wind."""
-    count = len(content["garment_rest_vertices"])
-    for name in ("garment_rest_vertices", "garment_vertices"):
-        inner = content[name]
-        middle = inner.mean(axis=-2, keepdims=True)
-        content[name] = np.concatenate([inner, middle + (inner - middle) * [1.2, 0.9, 1.2]], axis=-2).astype(np.float32)
-    faces = content["garment_faces"]
-    content["garment_faces"] = np.concatenate([faces, faces + count]).astype(np.int32)
-    content["garment_starts"] = np.array([0, count, 2 * count], np.int32)
-    frames = len(content["garment_vertices"])
-    content["wind"] = np.stack([np.linspace(0, 2, frames), np.zeros(frames), np.ones(frames)], 1).astype(np.float32)
 
 
 MATERIAL = Material(density=0.4, bend=1e-4)

@@ -79,6 +79,20 @@ def write(root: Path, name: str, split: str = "train", *, spoil=None, manifest=N
     return folder
 
 
+def two_layers(content: dict) -> None:
+    """Makes an outfit of the tube and a wider one over it, in a wind."""
+    count = len(content["garment_rest_vertices"])
+    for name in ("garment_rest_vertices", "garment_vertices"):
+        inner = content[name]
+        middle = inner.mean(axis=-2, keepdims=True)
+        content[name] = np.concatenate([inner, middle + (inner - middle) * [1.2, 0.9, 1.2]], axis=-2).astype(np.float32)
+    faces = content["garment_faces"]
+    content["garment_faces"] = np.concatenate([faces, faces + count]).astype(np.int32)
+    content["garment_starts"] = np.array([0, count, 2 * count], np.int32)
+    frames = len(content["garment_vertices"])
+    content["wind"] = np.stack([np.linspace(0, 2, frames), np.zeros(frames), np.ones(frames)], 1).astype(np.float32)
+
+
 def write_set(root: Path, train: int = 3, validation: int = 1, test: int = 1, **settings) -> Path:
     """Writes a data set of tubes with different seeds."""
     names = [("train", i) for i in range(train)] + [("validation", i) for i in range(validation)]

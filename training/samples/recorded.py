@@ -1,7 +1,8 @@
-"""One training sequence on the device, with everything that is the same for all its samples."""
+"""One recorded garment on the device, with everything that is the same for all its samples."""
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,16 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.heading import yaw
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
+from warpgarment.objects.material import Material
 from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.data.worn import WornGarment
 
 from .interactions import UnusableSequence, cached
 from .noise import NoiseBasis
 
 
 class SequenceData:
-    """One training sequence as tensors on the device, with precomputed means and interactions.
+    """One garment of a training sequence as tensors on the device, with precomputed means and interactions.
 
     Args:
         sequence: The loaded sequence.
@@ -32,28 +35,44 @@ class SequenceData:
         cache: Root folder of the cache of `interactions`.
         network: Settings of the network for which samples are made.
         device: Device on which samples are built.
+        number: Number of the garment of an outfit, from 0; None for all garments of the sequence as one.
+
+    Attributes:
+        material: Fields of its `Material`, float32 [M]; NaN if it has none.
+        air: Velocity of the air in each frame [m/s], float32 [T,3].
 
     Raises:
         UnusableSequence: The sequence has too few frames, or positions or interactions that are not finite.
     """
 
     def __init__(
-        self, sequence: Sequence, folder: Path, cache: Path, network: NetworkConfig, device: torch.device
+        self,
+        sequence: Sequence,
+        folder: Path,
+        cache: Path,
+        network: NetworkConfig,
+        device: torch.device,
+        number: int | None = None,
     ) -> None:
-        garment = sequence.garment
-        self.name, self.device, self.source = Path(folder).name, device, sequence
-        recorded = np.asarray(sequence.vertices, np.float32)
+        source = sequence if number is None else WornGarment(sequence, number)
+        garment = source.garment
+        self.name, self.device, self.source = Path(folder).name, device, source
+        recorded = np.asarray(source.vertices, np.float32)
         if len(recorded) < network.history + 1:
             raise UnusableSequence(f"{len(recorded)} frames, fewer than history + 1 = {network.history + 1}")
         if not np.isfinite(recorded).all():
             frame = int(np.nonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0][0])
             raise UnusableSequence(f"garment positions are not finite from frame {frame}")
-        interaction, geodesics = cached(sequence, folder, cache, device)
+        interaction, geodesics = (None if a is None else _writable(a) for a in cached(sequence, folder, cache, device))
+        assert interaction is not None
+        if isinstance(source, WornGarment):
+            self.name, own = f"{self.name}{source.name.removeprefix(sequence.name)}", source.faces
+            interaction, geodesics = interaction[:, own], None if geodesics is None else geodesics[own, own]
         if len(interaction) + 1 < network.history + 1:
             raise UnusableSequence(f"the body has only {len(interaction) + 1} frames")
         recorded = recorded[: len(interaction) + 1]
         self.vertices = torch.as_tensor(recorded if recorded.flags.writeable else recorded.copy(), device=device)
-        self.interaction = torch.from_numpy(_writable(interaction)).to(device)
+        self.interaction = torch.from_numpy(interaction).to(device)
         self.faces = torch.as_tensor(np.array(garment.faces, np.int32), device=device)
         self.rest = torch.as_tensor(np.array(garment.vertices, np.float32), device=device)
         self.inverse_rest = inverse_rest_frames(self.rest, self.faces)
@@ -65,6 +84,12 @@ class SequenceData:
         share = np.bincount(np.asarray(garment.faces).ravel(), minlength=len(self.rest)) / (3.0 * len(garment.faces))
         self.garment_weights = torch.as_tensor(share, dtype=torch.float32, device=device)  # [V]
         self.noise = NoiseBasis(np.asarray(garment.faces), vertex_component, np.asarray(garment.pins))
+
+        material = source.materials[0] if len(source.materials) == 1 else None
+        fields = (np.nan,) * len(dataclasses.fields(Material)) if material is None else dataclasses.astuple(material)
+        self.material = torch.tensor(fields, dtype=torch.float32, device=device)
+        wind = np.zeros((len(recorded), 3)) if source.wind is None else source.wind[: len(recorded)]
+        self.air = torch.as_tensor(np.array(wind, np.float32), device=device)
 
         velocity = self.interaction[..., INTERACTION.slices["velocity"]]
         hot = torch.nn.functional.one_hot(self.face_component, self.components).to(velocity.dtype)
@@ -82,7 +107,7 @@ class SequenceData:
         """The garment, with the cached geodesics, for unrolled samples."""
         garment = self.source.garment
         if self._geodesics is not None:
-            garment.__dict__.setdefault("geodesics", _writable(self._geodesics))
+            garment.__dict__.setdefault("geodesics", self._geodesics)
         return garment
 
     def body_frames(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -21,13 +21,15 @@ import torch
 
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
 from warpgarment.kernels.deformation.svd import singular_values
-from warpgarment.kernels.features.channels import FEATURES, INTERACTION, LAYOUT
+from warpgarment.kernels.features.channels import FEATURES, INTERACTION, LAYOUT, OUTDOOR
 from warpgarment.kernels.features.face import face_features
+from warpgarment.kernels.features.outdoor import attributes, columns, face_velocity
 from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
 from warpgarment.nn.heading import rotation_about_up
 from warpgarment.nn.parametrisation import NetworkOutput, Step, context, targets
+from warpgarment.nn.run import mirror_rows
 
 from .augmentation import Augmentation, mirror
 from .drawing import Past, displacement, part_of
@@ -50,6 +52,7 @@ class Batch(NamedTuple):
     ids: list[tuple[str, int]]  # name of the sequence, newest frame
     face_mask: torch.Tensor | None = None  # [B,N] bool; None where all are real
     faces: torch.Tensor | None = None  # scalar like `components`, for real faces; None where all are real
+    outdoor: torch.Tensor | None = None  # [B,N,K] channels of material and wind; None for networks without
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
         """Number of samples, and of operations of a training step on them (`nn/flops.py`)."""
@@ -87,6 +90,7 @@ class SampleBuilder:
         self.device = sequences[0].device
         self.kind = architecture(network.architecture)
         self.subsets = self.kind.subsets
+        self.outdoor = OUTDOOR.only(network.outdoor)
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the frame after `newest` is recorded."""
@@ -132,6 +136,7 @@ class SampleBuilder:
         velocity = torch.zeros(count, components, 3, device=device)
         body_velocity = torch.zeros(count, components, 3, device=device)
         origin = torch.empty(count, 1, 3, device=device)
+        outside = torch.empty(count, faces, self.outdoor.width, device=device) if self.outdoor.width else None
         start, next_start = 0, 0
         for b, (s, t) in enumerate(picks):
             sequence, rng = self.sequences[s], streams[b]
@@ -152,6 +157,8 @@ class SampleBuilder:
             past = (past - mean) @ similarity[b].mT
             after = (sequence.vertices[t + 1] - mean) @ similarity[b].mT
             centres = torch.einsum("cv,hvk->hck", sequence.component_weights, past)
+            if outside is not None:
+                outside[b] = self._outdoor(sequence, seen, past, sequence.air[t + 1] @ similarity[b].mT)
             velocities[b, : sequence.components] = (centres[1:] - centres[:-1]).transpose(0, 1).flatten(1)
             velocity[b, : sequence.components] = sequence.component_weights @ after - centres[-1]
             body_velocity[b, : sequence.components] = sequence.body_velocity[t] @ similarity[b].mT
@@ -191,7 +198,9 @@ class SampleBuilder:
         newest = context(features, face_component, 1)._replace(body_velocity=body_velocity)
         target = targets(step, newest, residual=self.network.residual)
         if mirrored.any():
-            features, velocities, target = mirror(features, velocities, target, self._send(mirrored))
+            chosen = self._send(mirrored)
+            features, velocities, target = mirror(features, velocities, target, chosen)
+            outside = None if outside is None else mirror_rows(outside, self.outdoor, chosen)
         mask = None
         if min(real) < components:
             mask = self._send(np.arange(components)[None] < np.array(real)[:, None])
@@ -199,12 +208,20 @@ class SampleBuilder:
         ids = [(self.sequences[s].name, t) for s, t in picks]
         weights = self.kind.rows(shown, self.network, device, scale)
         if self.subsets and not whole_garments:
-            return Batch(features, velocities, weights, mask, share, target, ids)
+            return Batch(features, velocities, weights, mask, share, target, ids, outdoor=outside)
         face_mask = None
         if min(sizes) < faces:
             face_mask = self._send(np.arange(faces)[None] < np.array(sizes)[:, None])
         total = torch.full((), all_faces * count / len(whole), device=device)
-        return Batch(features, velocities, weights, mask, share, target, ids, face_mask, total)
+        return Batch(features, velocities, weights, mask, share, target, ids, face_mask, total, outside)
+
+    def _outdoor(
+        self, sequence: SequenceData, chosen: torch.Tensor, past: torch.Tensor, air: torch.Tensor
+    ) -> torch.Tensor:
+        """Outdoor channels of the chosen faces [N,K], from a history [H,V,3] and the air [3] in the same frame."""
+        velocity = face_velocity(past[-1], past[-2], sequence.faces[chosen], self.network.fps)
+        cloth = attributes(sequence.material[None], velocity, 1).expand(len(chosen), -1)
+        return columns(self.outdoor, cloth, air.expand_as(velocity), velocity)
 
     def _drawn(
         self, picks: list[tuple[int, int]], streams: list[np.random.Generator]

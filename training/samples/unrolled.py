@@ -37,10 +37,12 @@ class UnrolledBatch:
 
     scene: Scene
     vertices: torch.Tensor  # [V,3] displaced positions at frame t
+    before: torch.Tensor  # [V,3] displaced positions at frame t-1
     history: History  # of the frames before t
     features: torch.Tensor  # [F,34] at frame t
     bodies: list[torch.Tensor]  # K+1 tensors [U,3], bodies at frames t..t+K
     recorded: list[torch.Tensor]  # K tensors [V,3], recorded positions at frames t+1..t+K
+    air: list[torch.Tensor]  # K tensors [B,3], velocity of the air at frames t+1..t+K [m/s]
     turn: torch.Tensor  # [B,3,3] rotation of the world for the network
     joint: torch.Tensor  # [B,3,3] the part of that rotation that the rest pose shares
     mirrored: torch.Tensor  # bool [B]
@@ -141,6 +143,7 @@ class UnrolledBuilder:
             collision_passes=self.collision_passes,
             half=False,
             timings=Timings(device),
+            materials=torch.stack([data.material for data in mine]),
         )
         positions, interactions = torch.cat(past, dim=1), torch.cat(rows, dim=1)  # [H,V,3], [H,F,16]
         known = zip(positions, interactions, strict=True)
@@ -150,10 +153,15 @@ class UnrolledBuilder:
         return UnrolledBatch(
             scene=scene,
             vertices=positions[-1].contiguous(),
+            before=positions[-2].contiguous(),
             history=History(features[:, :-1], means.diff(dim=1)),
             features=features[:, -1].contiguous(),
             bodies=placed[1:],
             recorded=recorded,
+            air=[
+                torch.stack([data.air[t + k] for (_, t), data in zip(picks, mine, strict=True)])
+                for k in range(1, self.steps + 1)
+            ],
             turn=turn,
             joint=joint,
             mirrored=mirrored,

@@ -9,6 +9,7 @@
     warpgarment evaluate --table figure12 --data DATA                   # bodies never seen
     warpgarment evaluate --table category --data DATA                   # a garment category never seen
     warpgarment evaluate --table long --data DATA                       # rollouts of 1,000 frames
+    warpgarment evaluate --table outdoor --data LAYERS                  # the right material and wind, others, none
 
 All of them measure by the protocol of `protocol.py` and write JSON, Markdown and PNG, by default to benchmarks/results.
 """
@@ -28,6 +29,7 @@ MAKERS = {
     "figure12": "groups",
     "category": "groups",
     "long": "long",
+    "outdoor": "outdoor",
 }
 
 

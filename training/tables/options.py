@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-TableName = Literal["table1", "table2", "figure5", "figure7", "figure9", "figure12", "category", "long", "recipe"]
+TableName = Literal[
+    "table1", "table2", "figure5", "figure7", "figure9", "figure12", "category", "long", "recipe", "outdoor"
+]
 
 RESULTS = Path("benchmarks/results")  # default folder of tables
 
@@ -24,11 +26,12 @@ class TableOptions:
         overrides: Network settings of every row, name=value.
         settings: Training settings of every row, name=value, as in batch_size=8 or pushforward.share=0.
         seed: Of every row's training.
-        against: Of figure9, figure12 and category: other networks to measure on the same sequences.
+        against: Of figure9, figure12, category and outdoor: other networks to measure on the same sequences.
         held_out: Of category: what was not trained on; none: what the data set's set.json says.
         faces: Of figure5 and figure7: numbers of faces to compare.
         long_frames: Of long: frames of each rollout.
         garments: Of long: bundled garments to take for a walk.
+        shuffles: Of outdoor: number of permutations of the materials, by the seeds 0, 1, ...
     """
 
     runs: Path = Path("runs")
@@ -43,6 +46,7 @@ class TableOptions:
     faces: tuple[int, ...] = (1000, 2000, 5000)
     long_frames: int = 1000
     garments: tuple[str, ...] = ("dress", "tshirt")
+    shuffles: int = 3
 
 
 class OptionMissing(ValueError):

@@ -30,7 +30,7 @@ class TrainConfig:
         overrides: Changes to that shape, `name=value`, for example `layers=6 geodesic_radius=0.3 residual=false`.
         init: Checkpoint to start from instead of random weights; its shape and statistics are kept. A file, a folder,
             or the name of a network that ships. A network of patches can also start from one of faces with the same
-            widths.
+            widths. Outdoor channels among the overrides (`outdoor=density,...,wind`) are added to it, without weight.
         grow: First grow `init` to the shape of `network` and `overrides`; its predictions stay the same.
         steps: Number of training steps; None for as many as `time_limit` allows.
         time_limit: Time after which the run stops cleanly, start and validation included [minutes]; None for no limit.
@@ -134,7 +134,7 @@ class TrainConfig:
 def _value(name: str, text: str, kind: type) -> Any:
     """Converts the text of an override to the type of its setting."""
     if kind is tuple:
-        return tuple(text.split(","))
+        return tuple(part for part in text.split(",") if part)
     if kind is not bool:
         return kind(text)
     if text.lower() not in ("true", "false"):

@@ -61,6 +61,7 @@ class Objective(nn.Module):
             tuple(batch.target),
             batch.face_mask,
             batch.faces,
+            batch.outdoor,
         )
 
     def forward(
@@ -73,9 +74,12 @@ class Objective(nn.Module):
         target: tuple[torch.Tensor, ...],
         face_mask: torch.Tensor | None = None,
         faces: torch.Tensor | None = None,
+        outdoor: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Loss of the fields of a `Batch`: the numbers of `Losses` in their order, float32 [4]."""
-        rows = RowInputs(features, velocities, weights, face_mask, velocity_mask, in_network_frame=True)
+        rows = RowInputs(
+            features, velocities, weights, face_mask, velocity_mask, in_network_frame=True, outdoor=outdoor
+        )
         ran = run(self.network, rows, noise=self.noise, bfloat16=self.in_bfloat16, target=NetworkOutput(*target))
         assert ran.target is not None  # as one was given
         parts = velocity_mask, components, face_mask, faces

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from warpgarment.io.npz import write_npz
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
+from warpgarment.nn.faces.grow import untrained
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import predict
@@ -24,7 +25,7 @@ from warpgarment.training.samples.loader import Loader, Plan
 from warpgarment.training.samples.outfits import OutfitBatch, OutfitBuilder
 from warpgarment.training.samples.pushforward import Pool
 from warpgarment.training.samples.single_step import Batch, SampleBuilder
-from warpgarment.training.samples.statistics import position_statistics, statistics
+from warpgarment.training.samples.statistics import outdoor_statistics, position_statistics, statistics
 from warpgarment.training.samples.unrolled import UnrolledBatch, UnrolledBuilder
 
 from . import state as training_state
@@ -149,13 +150,15 @@ class Run:
             self.pool.restore(extra)
             self.step, self.earlier, self.best = progress["step"], progress["elapsed"], progress["best"]
             self.pool.step, self.recent = progress["pool_step"], progress.get("recent", [])
-        elif config.init is None and group.first:
+        elif group.first and (config.init is None or untrained(self.network)):
             steps = range(2**30, 2**30 + config.statistics_batches)  # none of the run's own
             single: Loader[Any] = Loader(
                 self.builder, self.loader.plan, Pool(), 0.0, self.splits
             )  # single steps in any case
             batches = (single.build(step, splits=config.splits, part=slice(None)) for step in steps)
             measured = position_statistics if self.positions else statistics
+            if config.init is not None:  # it keeps its own; only channels that were just added have none yet
+                measured = outdoor_statistics
             self.network.set_statistics(measured(batches, self.network))
         group.agree("the step to resume from", self.step, SHARED_OUT)
         if not resumed:

@@ -34,7 +34,8 @@ def load_sequences(
     config: TrainConfig, network: NetworkConfig, skipped: dict[str, str], group: Group
 ) -> list[SequenceData] | list[OutfitData]:
     """Loads the training sequences, with their cached interactions if the network reads features of faces; adds
-    unusable ones and the reasons to `skipped`.
+    unusable ones and the reasons to `skipped`. Of an outfit, such a network gets the garments one by one, as in
+    simulations.
 
     Raises:
         NoTrainingData: No sequence can be used.
@@ -55,11 +56,14 @@ def load_sequences(
         try:
             loaded = Sequence.load(folder)
             check_rate(loaded.fps, network.fps)
-            sequences.append(
-                OutfitData(loaded, folder, network, group.device)
-                if positions
-                else SequenceData(loaded, folder, cache, network, group.device)
-            )
+            if positions:
+                sequences.append(OutfitData(loaded, folder, network, group.device))
+                continue
+            count = len(loaded.layers)
+            sequences += [
+                SequenceData(loaded, folder, cache, network, group.device, number if count > 1 else None)
+                for number in range(count)
+            ]
         except Exception as error:
             skipped[folder.name] = reason_of(error)
     names = "\n".join(f"{s.name} {len(s.faces)} {s.count}" for s in sequences)

@@ -13,11 +13,12 @@ and, with its own weight, the distance of the predicted vertices from the record
     L = 1/K sum_k [ L_def + lambda_sv L_sv + lambda_vel L_vel + position |V~_{t+k} - V_{t+k}| ]
 
 Gradients flow through the network at every step; through the state, that is deformation gradients, normals, centroids,
-distances and directions to the body, singular values, velocities and the heading; through the replacement of singular
-values; through the Poisson solve, in Phi and mean; through collision refinement, for fixed contacts; and through those
-targets that depend on the state. These are constants: the nearest body face with its nearest point, deformation and
-velocity, found at every step without gradient (the gradient of the distance is still exact; that of the direction is
-for a fixed nearest point); the rotation in the residual; the body and the pins on it; recorded frames.
+distances and directions to the body, singular values, velocities, the wind relative to faces and the heading; through
+the replacement of singular values; through the Poisson solve, in Phi and mean; through collision refinement, for fixed
+contacts; and through those targets that depend on the state. These are constants: the nearest body face with its
+nearest point, deformation and velocity, found at every step without gradient (the gradient of the distance is still
+exact; that of the direction is for a fixed nearest point); the rotation in the residual; the body and the pins on it;
+recorded frames.
 
 The Poisson solve needs whole garments, so the splits of the schedule become `face_splits` of the simulator: the network
 sees all faces, in interleaved subsets. Every sample has the same weight, whatever its number of faces, so the mean over
@@ -36,6 +37,7 @@ from torch import nn
 from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
 from warpgarment.kernels.deformation.svd import singular_values
 from warpgarment.kernels.features.channels import LAYOUT
+from warpgarment.kernels.features.outdoor import packed_columns
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
 from warpgarment.nn.rows import PaddedView
@@ -115,11 +117,22 @@ class UnrolledObjective(nn.Module):
         if they are not needed) and the recorded ones."""
         scene, config = batch.scene, self.network.config
         vertices, history, features = batch.vertices, batch.history, batch.features
+        before, packed = batch.before, scene.packed
         for k, recorded in enumerate(batch.recorded):
             stacked = history.stacked(features)
             newest = context(stacked.flatten(1), scene.packed.face_component, scene.packed.component_count)
             target = targets(self._wanted(batch, vertices, features, recorded), newest, residual=config.residual)
-            output, terms = self._network(batch, stacked.flatten(1), history.velocities.flatten(1), target)
+            outside = packed_columns(
+                self.network.outdoor,
+                config.fps,
+                vertices,
+                before,
+                packed.faces,
+                packed.garment_of_face,
+                scene.materials,
+                batch.air[k],
+            )
+            output, terms = self._network(batch, stacked.flatten(1), history.velocities.flatten(1), outside, target)
             last = k + 1 == len(batch.recorded)
             if last and not self.unroll.position:
                 yield terms, None, recorded
@@ -135,7 +148,7 @@ class UnrolledObjective(nn.Module):
             if not last:
                 velocity = scene.centroids(solved) - scene.centroids(vertices)
                 history = history.followed(stacked, velocity)
-                vertices = solved
+                before, vertices = vertices, solved
                 features = scene.features(vertices, body, batch.bodies[k + 2])
 
     @staticmethod
@@ -148,13 +161,19 @@ class UnrolledObjective(nn.Module):
         return Step(relative_deformation_gradient(phi_next, phi), singular_values(phi_next), velocity)
 
     def _network(
-        self, batch: UnrolledBatch, stacked: torch.Tensor, velocities: torch.Tensor, target: NetworkOutput
+        self,
+        batch: UnrolledBatch,
+        stacked: torch.Tensor,
+        velocities: torch.Tensor,
+        outside: torch.Tensor | None,
+        target: NetworkOutput,
     ) -> tuple[NetworkOutput, torch.Tensor]:
-        """Output of the network for packed inputs [F,H*34] and [C,(H-1)*3], and its losses [4] against a target."""
+        """Output of the network for packed inputs [F,H*34], [C,(H-1)*3] and [F,K], and its losses [4] against a
+        target."""
         output = NetworkOutput(*(torch.zeros_like(part) for part in target))
         terms = stacked.new_zeros(4)
         for view in batch.scene.layout.views:
-            rows, losses = self._view(batch, view, stacked, velocities, target)
+            rows, losses = self._view(batch, view, stacked, velocities, outside, target)
             view.add_to(output, rows)
             terms = terms + losses
         return output, terms
@@ -165,11 +184,12 @@ class UnrolledObjective(nn.Module):
         view: PaddedView,
         stacked: torch.Tensor,
         velocities: torch.Tensor,
+        outside: torch.Tensor | None,
         target: NetworkOutput,
     ) -> tuple[NetworkOutput, torch.Tensor]:
         """Output of the network for the rows of a view, in world space, and their share of the losses [4]."""
         garment = batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
-        rows = view.inputs(stacked, velocities)._replace(
+        rows = view.inputs(stacked, velocities, outside)._replace(
             turn=batch.turn[garment], rest_turn=batch.joint[garment], mirrored=batch.mirrored[garment]
         )
         wanted = NetworkOutput(

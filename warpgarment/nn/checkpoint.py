@@ -182,6 +182,15 @@ def shipped() -> dict[str, Path]:
     return files | {index.parent.name: index.parent for index in WEIGHTS.glob(f"*/{shards.INDEX}")}
 
 
+def shipped_reads() -> dict[str, frozenset[str]]:
+    """The optional inputs that each network that ships reads (`GarmentNetwork.reads`), by name."""
+    found = {}
+    for name, place in sorted(_shipped().items()):
+        with torch.device("meta"):  # only its settings are read
+            found[name] = build_network(read_metadata(place)[0]).reads
+    return found
+
+
 def _default(ships: Mapping[str, Path], device: torch.device | str | None) -> str:
     # only the kind of device counts here: the caller that runs the network checks that there is one
     if device is None:

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
-from warpgarment.kernels.features.channels import FACE
+from warpgarment.kernels.features.channels import FACE, OUTDOOR
 
 from .architecture import check_name
 from .attention import ACTIVATIONS
@@ -61,6 +61,7 @@ class NetworkConfig:
     face_feed_forward: int = 128
     face_layers: int = 2  # number of face layers after the patches; there is one more before them
     channels: tuple[str, ...] = CHANNELS  # features of a face that the network reads, see kernels/features/channels.py
+    outdoor: tuple[str, ...] = ()  # channels of material and wind that it reads too: kernels/features/outdoor.py
 
     def __post_init__(self) -> None:
         for name in ("embedding", "layers", "feed_forward", "heads", "face_embedding", "face_feed_forward"):
@@ -87,17 +88,25 @@ class NetworkConfig:
         if not self.channels:
             raise ValueError(f"channels must name at least one of {', '.join(FACE.names)}")
         FACE.only(self.channels)
+        OUTDOOR.only(self.outdoor)
 
     @property
     def features(self) -> int:
         """Number of features of a face in a frame that the network reads: 34 with the default channels."""
         return FACE.only(self.channels).width
 
+    @property
+    def inputs(self) -> int:
+        """Number of inputs of a face: its features in all frames of the history, and its outdoor channels."""
+        return self.history * self.features + OUTDOOR.only(self.outdoor).width
+
     def as_dict(self) -> dict[str, Any]:
-        """Settings as plain values, for a checkpoint; without `channels` if these are the default `CHANNELS`."""
+        """Settings as plain values, for a checkpoint; without `channels` and `outdoor` if these are the defaults."""
         values = dataclasses.asdict(self)
         if self.channels == CHANNELS:
             del values["channels"]
+        if not self.outdoor:
+            del values["outdoor"]
         return values
 
     @classmethod

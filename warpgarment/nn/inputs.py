@@ -53,6 +53,7 @@ class RowInputs(NamedTuple):
     rest_turn: torch.Tensor | None = None  # [R,3,3] rotation of the rest pose
     mirrored: torch.Tensor | None = None  # bool [R], which rows are mirrored in x, after the turns
     in_network_frame: bool = False  # inputs and target are already turned and mirrored
+    outdoor: torch.Tensor | None = None  # [R,N,K] channels of the material and the wind: kernels/features/outdoor.py
 
 
 class NormalisedOutput(NamedTuple):

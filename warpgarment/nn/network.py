@@ -12,9 +12,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import nn
 
-from warpgarment.kernels.features.channels import FACE, FEATURES
+from warpgarment.kernels.features.channels import FACE, FEATURES, OUTDOOR
+from warpgarment.kernels.features.outdoor import needs, packed_columns
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
@@ -38,17 +40,20 @@ class GarmentNetwork(nn.Module):
 
     Attributes:
         reads: Names of the optional fields of `FrameInputs` that `predict` needs: `previous`, `materials`, `wind`,
-            `pairs`, `skin`.
+            `pairs`, `skin`. Outdoor channels of `config` add those that they need.
         statistics: Buffers of the normalisation and their lengths.
     """
 
     reads: frozenset[str] = frozenset()
     statistics: Mapping[str, int] = STATISTICS
 
+    embed_faces: nn.Linear
     face_head: nn.Linear
     velocity_head: nn.Linear
     feature_mean: torch.Tensor
     feature_std: torch.Tensor
+    outdoor_mean: torch.Tensor
+    outdoor_std: torch.Tensor
     velocity_mean: torch.Tensor
     velocity_std: torch.Tensor
     psi_mean: torch.Tensor
@@ -62,6 +67,10 @@ class GarmentNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.channels = FACE.only(config.channels)
+        self.outdoor = OUTDOOR.only(config.outdoor)
+        if width := self.outdoor.width:
+            self.reads = self.reads | needs(config.outdoor)
+            self.statistics = {**self.statistics, "outdoor_mean": width, "outdoor_std": width}
         for name, length in self.statistics.items():
             length = self.channels.width if name.startswith("feature_") else length
             start = torch.zeros(length) if name.endswith("_mean") else torch.ones(length)
@@ -101,6 +110,7 @@ class GarmentNetwork(nn.Module):
         *,
         face_mask: torch.Tensor | None = None,
         velocity_mask: torch.Tensor | None = None,
+        outdoor: torch.Tensor | None = None,
     ) -> NetworkOutput:
         """Runs the network on rows of garments; inputs and outputs are in physical units and world space.
 
@@ -111,11 +121,13 @@ class GarmentNetwork(nn.Module):
                 in padded columns; for a `PatchTransformer` a `PatchLayout`. B may be 1 if all rows are of one garment.
             face_mask: True where a face is real, shape [B,N]; None where all are.
             velocity_mask: True where a component is real, shape [B,C]; None where all are.
+            outdoor: Channels of the material and the wind, from `kernels.features.outdoor`, shape [B,N,K]. None
+                for faces whose material is not known and that move with the air.
 
         Returns:
             The output, whose meaning is defined by `parametrisation.compose`. Padded entries are finite but arbitrary.
         """
-        inputs = RowInputs(face_features, velocities, weights, face_mask, velocity_mask)
+        inputs = RowInputs(face_features, velocities, weights, face_mask, velocity_mask, outdoor=outdoor)
         return run(self, inputs).output
 
     def layout(self, garments: Sequence[Garment], packed: PackedGarments, *, face_splits: int = 1) -> Any:
@@ -143,8 +155,12 @@ class GarmentNetwork(nn.Module):
         output = NetworkOutput(
             features.new_empty((faces, 3, 3)), features.new_empty((faces, 3)), features.new_zeros((components, 3))
         )
+        air = None if inputs.wind is None else inputs.wind[0]
+        before = None if inputs.previous is None else inputs.previous[0]
+        on = layout.faces, layout.garment_of_face
+        outside = packed_columns(self.outdoor, self.config.fps, inputs.vertices, before, *on, inputs.materials, air)
         for view in layout.views:
-            view.add_to(output, run(self, view.inputs(features, velocities), bfloat16=bfloat16).output)
+            view.add_to(output, run(self, view.inputs(features, velocities, outside), bfloat16=bfloat16).output)
         newest = context(features, layout.face_component, components)
         return compose(output, newest, residual=self.config.residual)
 
@@ -172,6 +188,33 @@ class GarmentNetwork(nn.Module):
             return face_features
         return FACE.take(face_features.unflatten(-1, (-1, FEATURES)), self.channels.names).flatten(-2)
 
+    def known(self, outdoor: torch.Tensor) -> torch.Tensor:
+        """Outdoor channels [...,K] with the mean, which is zero after normalisation, where a material is not known."""
+        return torch.where(outdoor.isnan(), self.outdoor_mean, outdoor)
+
+    def with_outdoor(
+        self, x: torch.Tensor, outdoor: torch.Tensor | None, face_mask: torch.Tensor | None, *, embedded: bool
+    ) -> torch.Tensor:
+        """Inputs of faces with their outdoor channels.
+
+        Args:
+            x: Normalised features, shape [R,N,H*K], or with `embedded` the result of the method `embedded`.
+            outdoor: Channels in the network's frame, all of them known, shape [R,N,K]; None for zero when normalised.
+            face_mask: True where a face is real, shape [R,N]; None where all are.
+            embedded: Whether the first layer is already applied to x.
+        """
+        if not self.outdoor.width:
+            return x
+        if outdoor is None:
+            outside = x.new_zeros((*x.shape[:-1], self.outdoor.width))
+        else:
+            outside = (outdoor - self.outdoor_mean) / self.outdoor_std
+        if not embedded:
+            return torch.cat([x, outside], dim=-1)
+        if face_mask is not None:
+            outside = torch.where(face_mask[..., None], outside, 0.0)
+        return x + F.linear(outside, self.embed_faces.weight[:, -self.outdoor.width :])
+
     def encode_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
         """Normalises velocities in the network's frame."""
         return ((velocities.unflatten(-1, (-1, 3)) - self.velocity_mean) / self.velocity_std).flatten(-2)
@@ -188,7 +231,8 @@ class GarmentNetwork(nn.Module):
         """The network itself: normalised inputs to normalised outputs.
 
         Args:
-            x: Features of the channels it reads, oldest frame first, shape [R,N,H*K].
+            x: Features of the channels it reads, oldest frame first, and after them its outdoor channels if it has any,
+                shape [R,N,`config.inputs`].
             v: Velocities of components, shape [R,C,(H-1)*3].
             rows: The result of `Architecture.rows` for this kind of network.
             face_mask: True where a face is real, shape [R,N]; None where all are.

@@ -54,10 +54,13 @@ class PaddedView:
         """Takes values of packed components to rows, [C,...] -> [R,C,...]."""
         return packed[self.component_index]
 
-    def inputs(self, features: torch.Tensor, velocities: torch.Tensor) -> RowInputs:
-        """Inputs of these rows, from packed features [F,H*K] and velocities [C,(H-1)*3]."""
+    def inputs(
+        self, features: torch.Tensor, velocities: torch.Tensor, outdoor: torch.Tensor | None = None
+    ) -> RowInputs:
+        """Inputs of these rows, from packed features [F,H*K], velocities [C,(H-1)*3] and outdoor channels [F,K]."""
         rows = self.faces(features), self.components(velocities)
-        return RowInputs(*rows, self.weights, self.face_mask, self.component_mask)
+        outside = None if outdoor is None else self.faces(outdoor)
+        return RowInputs(*rows, self.weights, self.face_mask, self.component_mask, outdoor=outside)
 
     def add_to(self, packed: NetworkOutput, rows: NetworkOutput) -> None:
         """Writes the output of these rows into packed arrays.
@@ -77,13 +80,16 @@ class RowLayout(NamedTuple):
 
     views: list[PaddedView]
     face_component: torch.Tensor  # int32 [F], component of each packed face
+    faces: torch.Tensor  # int32 [F,3], global vertex indices
+    garment_of_face: torch.Tensor  # int32 [F]
 
 
 def row_layout(
     packed: PackedGarments, garments: Sequence[Garment], config: NetworkConfig, face_splits: int = 1
 ) -> RowLayout:
     """The `RowLayout` of a batch; the arguments are those of `padded_views`."""
-    return RowLayout(padded_views(packed, garments, config, face_splits), packed.face_component)
+    views = padded_views(packed, garments, config, face_splits)
+    return RowLayout(views, packed.face_component, packed.faces, packed.garment_of_face)
 
 
 def padded_views(

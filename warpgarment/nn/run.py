@@ -74,10 +74,12 @@ def run(
             features, velocities = mirror_inputs(features, velocities, mirrored)
             target = None if target is None else mirror_output(target, mirrored)
         x = network.encode(features) if embedded is None else embedded
+        outdoor = _outdoor(network, inputs, turn)
         v = network.encode_velocities(velocities)
         if noise:
             x = x + noise * torch.randn_like(x)
             v = v + noise * torch.randn_like(v)
+        x = network.with_outdoor(x, outdoor, inputs.face_mask, embedded=embedded is not None)
     call = network.forward_normalised if embedded is None else network.forward_embedded
     with torch.autocast(kind, dtype=dtype, enabled=half):
         normalised = call(x, v, inputs.rows, face_mask=inputs.face_mask, component_mask=inputs.component_mask)
@@ -95,6 +97,16 @@ def _turn(network: GarmentNetwork, inputs: RowInputs) -> torch.Tensor | None:
         return None if inputs.in_network_frame else inputs.turn
     own = canonical_frame(inputs.features, inputs.face_mask)
     return own if inputs.turn is None else inputs.turn @ own
+
+
+def _outdoor(network: GarmentNetwork, inputs: RowInputs, turn: torch.Tensor | None) -> torch.Tensor | None:
+    """Outdoor channels in the network's frame, [R,N,K]; None if the network has none or none are given."""
+    if inputs.outdoor is None or not network.outdoor.width:
+        return None
+    rows = network.known(inputs.outdoor)
+    if turn is not None:
+        rows = rows @ network.outdoor.turn(turn).mT
+    return rows if inputs.mirrored is None else mirror_rows(rows, network.outdoor, inputs.mirrored)
 
 
 def rotate_output(output: NetworkOutput, turn: torch.Tensor | None, *, inverse: bool = False) -> NetworkOutput:
@@ -118,6 +130,11 @@ def mirror_inputs(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Features [R,N,H*K] and velocities [R,C,(H-1)*3], mirrored in x in the chosen rows, bool [R]."""
     return features * _signs(FACE, features, chosen), velocities * _signs(VELOCITY, velocities, chosen)
+
+
+def mirror_rows(rows: torch.Tensor, layout: Layout, chosen: torch.Tensor) -> torch.Tensor:
+    """Channels of a layout [R,N,K], mirrored in x in the chosen rows, bool [R]."""
+    return rows * _signs(layout, rows, chosen)
 
 
 def mirror_output(output: NetworkOutput, chosen: torch.Tensor) -> NetworkOutput:

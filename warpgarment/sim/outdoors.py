@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warpgarment.nn import checkpoint
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.objects.material import Material
 from warpgarment.objects.wind import FASTEST, Wind, too_fast
@@ -96,5 +97,11 @@ def air_of(wind: np.ndarray | None, frame: int, device: torch.device) -> torch.T
 
 def refuse(network: GarmentNetwork, name: str) -> None:
     """Raises ValueError if a network does not read an input that was given."""
-    if name not in network.reads:
-        raise ValueError(f"{name} given, but a {type(network).__name__} reads none; a LayersNet does")
+    if name in network.reads:
+        return
+    shipped = [known for known, reads in checkpoint.shipped_reads().items() if name in reads]
+    ships = f"; of those that ship, {', '.join(shipped)}" if shipped else ""
+    raise ValueError(
+        f"{name} given, but this {type(network).__name__} reads none. A LayersNet does, and so does a network trained "
+        f"with the setting outdoor{ships}"
+    )

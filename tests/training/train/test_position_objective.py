@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import torch
 from support import sequences
-from support.outfits import GARMENTS, MATERIAL, TRAINED, batch_of, builder_of, network_of, recorded, two_layers
+from support.outfits import GARMENTS, MATERIAL, TRAINED, batch_of, builder_of, network_of, recorded
 from support.runs import config_for, entries_of
+from support.sequences import two_layers
 
 from warpgarment.errors import MeshError
 from warpgarment.nn import checkpoint

@@ -18,6 +18,7 @@ from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import build_network
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.grow import added
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.sim.simulator import Simulator
 from warpgarment.sim.stages import features
@@ -124,10 +125,18 @@ def test_one_step_has_the_loss_of_one_step_training(loaded, network, augmentatio
     torch.testing.assert_close(found[:4], expected.detach(), rtol=1e-3, atol=0.0)
 
 
-@pytest.mark.parametrize("which", [0, 4])
-def test_gradients_are_those_of_finite_differences(loaded, network, monkeypatch, which):
+def windy(network: ManifoldAwareTransformer) -> ManifoldAwareTransformer:
+    """The network with the wind relative to each face as one more input, on which it depends as on the others."""
+    made = added(network, ("wind",))
+    torch.nn.init.normal_(made.embed_faces.weight[:, -3:], std=0.3)
+    made.set_statistics({"outdoor_std": [0.05] * 3})
+    return made
+
+
+@pytest.mark.parametrize(("which", "wind"), [(0, False), (4, False), (4, True)])
+def test_gradients_are_those_of_finite_differences(loaded, network, monkeypatch, which, wind):
     """A gradient is lost on the way through three steps: between the prediction and the state, in a solve, in the
-    features, or in targets that depend on the state.
+    features, in the velocities of faces relative to the air, or in targets that depend on the state.
 
     Along random directions of the weights, all uphill so that the slope is far above rounding, for the whole loss (0)
     and the distance from the recording alone (4). Nearest points are those found at first: they are constants of the
@@ -151,6 +160,7 @@ def test_gradients_are_those_of_finite_differences(loaded, network, monkeypatch,
 
     monkeypatch.setattr(features, "body_interaction", remembered)
     monkeypatch.setattr(unroll, "weighted", squares)
+    network = windy(network) if wind else network
     batch = batch_of(loaded, network, [(0, T + 1), (1, T + 1)])
     objective, parameters = objective_of(network, position=1.0), list(network.parameters())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Hashable, Iterator, Sequence
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR
-from warpgarment.kernels.features.channels import FEATURES
+from warpgarment.kernels.features.channels import FEATURES, OUTDOOR
 from warpgarment.nn.architecture import Architecture
 from warpgarment.nn.attention import geodesic_weights
 from warpgarment.nn.config import NetworkConfig
@@ -20,6 +21,7 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.rows import activation_bytes, row_groups
 from warpgarment.objects.garment import Garment
 
+from .grow import added
 from .grow import grow as grown
 from .layout import Sampled, pooled_weights, sampled
 from .network import ManifoldAwareTransformer
@@ -83,7 +85,7 @@ class Faces(Architecture):
 
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
         """Bytes of geodesic weights, of the distances they are made from (on a CPU), and of a call of the network."""
-        garments, stack = sizes.garments, 4 * config.history * FEATURES
+        garments, stack = sizes.garments, 4 * (config.history * FEATURES + OUTDOOR.width)
         weights, largest, network = 0, 0, 0
         for group in row_groups(garments, config, sizes.face_splits, cpu=sizes.cpu):
             length, matrices, pooled = max(count for _, _, count in group), 0, garments[group[0][0]].pools
@@ -110,15 +112,18 @@ class Faces(Architecture):
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: Any) -> tuple[int, int]:
         """Operations as in flops.py; pooled weights count like a full matrix."""
         heads = 2 * config.embedding * (12 * faces + 3 * components)
-        inputs = faces * config.history * config.features + components * 3 * (config.history - 1)
+        inputs = faces * config.inputs + components * 3 * (config.history - 1)
         layers, geodesic = layer_flops(config, faces, components)
         return layers + heads, 2 * config.embedding * inputs + geodesic
 
     def start_from(
         self, network: GarmentNetwork, config: NetworkConfig, *, grow: bool, seed: int = 0
     ) -> GarmentNetwork:
-        """The network grown as in grow.py; without `grow` the network itself, in its own shape."""
-        return grown(network, config, seed=seed) if grow else network
+        """The network grown as in grow.py; without `grow` the network itself, in its own shape. Both with the outdoor
+        channels of `config`, at first without weight."""
+        if grow:
+            network = grown(network, dataclasses.replace(config, outdoor=network.config.outdoor), seed=seed)
+        return added(network, config.outdoor)
 
 
 def _padded(lengths: Sequence[int], matrices: Iterator[torch.Tensor]) -> torch.Tensor:

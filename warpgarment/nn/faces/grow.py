@@ -12,6 +12,8 @@ pre-norm encoder layers of attention.py:
   queries of a learned head that becomes wider are scaled by sqrt(new width / old width), since its softmax divides by
   the square root of the width.
 - New layers add zero to the stream at first. They lie evenly between the old ones.
+
+New inputs, the outdoor channels of a network of any kind (`added`), have weights of zero.
 """
 
 from __future__ import annotations
@@ -19,14 +21,15 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import cast
 
 import torch
 from torch import nn
 
-from warpgarment.nn.architecture import GrowthError
+from warpgarment.nn.architecture import GrowthError, build_network
 from warpgarment.nn.attention import EncoderLayer
-from warpgarment.nn.config import STATISTICS, NetworkConfig
+from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.network import GarmentNetwork
 
 from .network import ManifoldAwareTransformer
@@ -64,6 +67,48 @@ def grow(small: GarmentNetwork, config: NetworkConfig, *, seed: int = 0) -> Mani
     return large.to(device).train(small.training)
 
 
+def added(network: GarmentNetwork, channels: Sequence[str]) -> GarmentNetwork:
+    """A network that also reads some channels of `OUTDOOR`, with weights of zero, so that it predicts the same.
+
+    Args:
+        network: A network whose first layer of faces is `embed_faces`.
+        channels: Names of channels of `OUTDOOR`, those that it reads already first and in their order.
+
+    Returns:
+        The network itself if it reads these channels already, or if none are named.
+
+    Raises:
+        ValueError: It reads other channels, or in another order.
+    """
+    before = network.config.outdoor
+    if not channels or tuple(channels) == before:
+        return network
+    if tuple(channels[: len(before)]) != before:
+        raise ValueError(
+            f"the network reads the outdoor channels {','.join(before)}; more can only be added after these, as in "
+            f"outdoor={','.join((*before, *(name for name in channels if name not in before)))}"
+        )
+    made = build_network(dataclasses.replace(network.config, outdoor=tuple(channels)))
+    own = made.state_dict()
+    for name, tensor in network.state_dict().items():
+        if name == "embed_faces.weight":
+            own[name].zero_()
+            own[name][:, : tensor.shape[1]] = tensor.cpu()
+        elif name.startswith("outdoor_"):
+            own[name][: len(tensor)] = tensor.cpu()
+        else:
+            own[name].copy_(tensor.cpu())
+    made.load_state_dict(own)
+    weight = network.face_head.weight
+    return made.to(weight.device, weight.dtype).train(network.training)
+
+
+def untrained(network: GarmentNetwork) -> bool:
+    """Whether a network has such channels but gives no weight to any, as the result of `added`."""
+    width = network.outdoor.width
+    return bool(width) and not bool(network.embed_faces.weight[:, -width:].any())
+
+
 def _check(old: NetworkConfig, new: NetworkConfig) -> None:
     for field in dataclasses.fields(NetworkConfig):
         before, after = getattr(old, field.name), getattr(new, field.name)
@@ -94,7 +139,7 @@ def _check(old: NetworkConfig, new: NetworkConfig) -> None:
 
 def _fill(large: ManifoldAwareTransformer, small: ManifoldAwareTransformer) -> None:
     copies = large.config.embedding // small.config.embedding
-    for name in STATISTICS:
+    for name in small.statistics:
         getattr(large, name).copy_(getattr(small, name))
     for writes in ("embed_faces", "embed_velocity"):
         into, source = getattr(large, writes), getattr(small, writes)

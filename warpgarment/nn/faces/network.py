@@ -30,7 +30,7 @@ class ManifoldAwareTransformer(GarmentNetwork):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
-        self.embed_faces = nn.Linear(config.history * config.features, config.embedding)
+        self.embed_faces = nn.Linear(config.inputs, config.embedding)
         self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
         self.layers = self.encoder_layers()
         self.final_norm = nn.LayerNorm(config.embedding) if config.norm_first else nn.Identity()

@@ -55,6 +55,8 @@ class LayersNetConfig(NetworkConfig):
         super().__post_init__()
         if self.history != 3:
             raise ValueError(f"history of a LayersNet is 3 frames, got {self.history}")
+        if self.outdoor:
+            raise ValueError("a LayersNet always reads materials and wind; leave out outdoor")
         if not 1 <= self.world_heads < self.heads:
             raise ValueError(f"world_heads must lie between 1 and heads - 1 = {self.heads - 1}, got {self.world_heads}")
         if self.rotation not in ("orthogonal", "published"):

@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import torch
 
+from warpgarment.kernels.features.outdoor import attributes
 from warpgarment.kernels.features.skin import Skin
 from warpgarment.nn.heading import rotation_about_up, yaw
 from warpgarment.nn.inputs import FrameInputs
@@ -39,13 +40,6 @@ from .turns import quaternions, unit
 GRAVITY = 9.81  # m/s^2
 KEPT = 0.75  # share of the motion about the body that is kept in a frame at 30 a second; the data's is 0.65 to 0.85
 ROOT_ACCELERATION, AIR_SPEED = 10.0, 5.0  # m/s^2 and m/s that are one in the wind's descriptor
-ATTRIBUTES = (  # number of the field of `Material`, its common value, its least value (SI)
-    (0, 0.3, 1e-3),  # density [kg/m^2]
-    (1, 1e3, 1.0),  # stretch [N/m]
-    (2, 1e3, 1.0),  # shear [N/m]
-    (3, 1e-3, 1e-6),  # bend [N]
-    (5, 0.3, 1e-2),  # friction
-)
 
 
 class Seen(NamedTuple):
@@ -133,7 +127,7 @@ def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool
         gravity=gravity,
         wind=torch.stack(wind, dim=1),
         air=_turned(air[0], turn),
-        attributes=_attributes(inputs.materials, x[0], count),
+        attributes=attributes(inputs.materials, x[0], count),
         outfit_of_vertex=of_vertex,
         outfit_of_body=of_body,
         outfit_of_garment=of_garment,
@@ -217,10 +211,3 @@ def _normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
     cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     summed = torch.zeros_like(vertices).index_add(0, faces.long().flatten(), cross.repeat_interleave(3, dim=0))
     return unit(summed * 1e3)  # of areas near 1e-4 m^2
-
-
-def _attributes(materials: torch.Tensor | None, like: torch.Tensor, count: int) -> torch.Tensor:
-    if materials is None:
-        return like.new_full((count, len(ATTRIBUTES)), torch.nan)
-    columns = [(materials[:, field].clamp(min=least) / common).log10() for field, common, least in ATTRIBUTES]
-    return torch.stack(columns, dim=1).to(like.dtype)

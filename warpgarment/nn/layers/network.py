@@ -22,6 +22,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import nn
 
+from warpgarment.kernels.features.outdoor import ATTRIBUTES
 from warpgarment.kernels.neighbours import NearestPoints
 from warpgarment.nn.inputs import FrameInputs, VertexStep
 from warpgarment.nn.network import GarmentNetwork
@@ -31,7 +32,7 @@ from warpgarment.objects.pack import PackedGarments
 from .block import Block, Edges, Links, Tokens
 from .cloth import ClothLayout, cloth_layout, cloth_patches
 from .config import BODY, VERTEX_PATCHES, LayersNetConfig
-from .inputs import ATTRIBUTES, Seen, acceleration, moved, positions, seen
+from .inputs import Seen, acceleration, moved, positions, seen
 from .turns import Bases, frames, turned
 
 STATE, ABOUT, GRAVITY, WIND = 12, 6, 6, 22

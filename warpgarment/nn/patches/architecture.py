@@ -11,14 +11,16 @@ layers after the patches: the encoder layers run on P + C tokens, and around the
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from warpgarment.kernels.features.channels import FEATURES
+from warpgarment.kernels.features.channels import FEATURES, OUTDOOR
 from warpgarment.nn.architecture import Architecture, GrowthError
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.faces.grow import added
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.nn.flops import layer_flops
 from warpgarment.nn.inputs import NetworkSizes
@@ -62,7 +64,7 @@ class PatchesOfCloth(Architecture):
 
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
         """Bytes of the patches of all faces, and of a call of the network."""
-        garments, stack = sizes.garments, 4 * config.history * FEATURES
+        garments, stack = sizes.garments, 4 * (config.history * FEATURES + OUTDOOR.width)
         stacks = (STACKS[len(garments) > 1],) * 2
         layouts, network = 0, 0
         for group in row_groups(garments, config, 1, cpu=sizes.cpu):
@@ -76,7 +78,7 @@ class PatchesOfCloth(Architecture):
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: PatchLayout) -> tuple[int, int]:
         """Operations as at the top of this file."""
         e, width, patches = config.embedding, config.face_embedding, rows.start.shape[1]
-        embedding = 2 * (width * faces * config.history * config.features + e * components * 3 * (config.history - 1))
+        embedding = 2 * (width * faces * config.inputs + e * components * 3 * (config.history - 1))
         layers, geodesic = layer_flops(config, patches, components)
         layers += (6 * config.face_layers + 4) * faces * width * config.face_feed_forward + 4 * patches * width * e
         layers += 2 * components * width * (patches + e)
@@ -85,7 +87,8 @@ class PatchesOfCloth(Architecture):
     def start_from(
         self, network: GarmentNetwork, config: NetworkConfig, *, grow: bool, seed: int = 0
     ) -> GarmentNetwork:
-        """A network of patches from one of faces, by `PatchTransformer.from_faces`; any other network as it is."""
+        """A network of patches from one of faces, by `PatchTransformer.from_faces`; any other network as it is. Both
+        with the outdoor channels of `config`, at first without weight."""
         if grow:
             raise GrowthError(
                 f"only networks of faces can be grown, and to a shape of faces; this shape has "
@@ -94,5 +97,6 @@ class PatchesOfCloth(Architecture):
                 "from that: init without grow, for a shape of patches with its widths"
             )
         if isinstance(network, ManifoldAwareTransformer):
-            return PatchTransformer.from_faces(network, config).to(network.face_head.weight.device)
-        return network
+            shape = dataclasses.replace(config, outdoor=network.config.outdoor)
+            network = PatchTransformer.from_faces(network, shape).to(network.face_head.weight.device)
+        return added(network, config.outdoor)

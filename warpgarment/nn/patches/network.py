@@ -73,7 +73,7 @@ class PatchTransformer(GarmentNetwork):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         width = config.face_embedding
-        self.embed_faces = nn.Linear(config.history * config.features, width)
+        self.embed_faces = nn.Linear(config.inputs, width)
         self.embed_velocity = nn.Linear((config.history - 1) * 3, config.embedding)
         self.before = self._face_layer(hears=False)
         self.to_patches = nn.Linear(width, config.embedding)
@@ -137,7 +137,10 @@ class PatchTransformer(GarmentNetwork):
         W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
         """
         face_features = self.read(self._without_padding(face_features, face_mask))
-        scaled = self.embed_faces.weight.unflatten(1, (-1, self.channels.width)) / self.feature_std  # [E,H,K]
+        weight = self.embed_faces.weight
+        if self.outdoor.width:
+            weight = weight[:, : -self.outdoor.width]
+        scaled = weight.unflatten(1, (-1, self.channels.width)) / self.feature_std  # [E,H,K]
         bias = self.embed_faces.bias - scaled.sum(dim=1) @ self.feature_mean
         if turn is None:
             return F.linear(face_features, scaled.flatten(1), bias)
