@@ -111,7 +111,7 @@ def rollout_figures(
 
 
 def frame_figures(outfit: Outfit, vertices: np.ndarray, body: np.ndarray, body_faces: np.ndarray) -> list[float]:
-    """The figures of `OF_FRAMES` in one frame, NaN where there is no inner garment; arguments as above, of one frame."""
+    """The figures of `OF_FRAMES` in one frame, NaN where there is no inner garment; arguments as in a rollout."""
     points, parts = np.asarray(vertices, np.float64), outfit.parts
     h = [f(points, body, body_faces).mean() for f in (behind_planes, inside)]
     pairs = outfit.owner[crossing_pairs(points, outfit.faces, outfit.same)]

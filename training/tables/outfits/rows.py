@@ -69,7 +69,10 @@ class Row:
     @cached_property
     def checksum(self) -> str | None:
         """sha256 of the checkpoint."""
-        return None if self.file is None else hashlib.sha256(self.file.read_bytes()).hexdigest()
+        if self.file is None:
+            return None
+        files = sorted(self.file.glob("*.safetensors")) if self.file.is_dir() else [self.file]
+        return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
     def mover(self) -> Callable[[Sequence, BodyMotion, Start, int], np.ndarray]:
         """A function that moves the outfit of a sequence.

@@ -179,7 +179,7 @@ class StaticGarment(nn.Module):
         try:
             with safe_open(path, "pt") as file:
                 about = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                tensors = {name: file.get_tensor(name) for name in file.keys()}
             if about.get("kind") != KIND:
                 raise CheckpointError(f"{path} holds no static garment model; `outfits train-static` makes one")
             network = cls(**{key: int(value) for key, value in json.loads(about["settings"]).items()})
