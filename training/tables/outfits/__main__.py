@@ -44,7 +44,7 @@ NOT_BUILT = (
     "garments apart, a LayersNet in which each garment is alone with its body, though trained on whole outfits. The "
     "static row is in the manner of DeePSD (training/tables/outfits/static.py), without losses against collisions."
 )
-PAGE = "The commands below write this page (`--page`). layersnet.md has the network, and what differs from the publication."
+PAGE = "The commands below write this page (`--page`). layersnet.md says what differs from the publication."
 
 
 @dataclass(frozen=True)

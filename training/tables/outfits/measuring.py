@@ -6,6 +6,7 @@ measures are the same; so table 5 takes what table 4 has measured, and an interr
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import re
@@ -148,6 +149,7 @@ def measured(mover: Mover, case: Case, start: Start, steps: int) -> dict[str, An
     return figures | {"seconds": seconds, "reason": reason}
 
 
+@functools.cache
 def code_checksum() -> str:
     """Checksum of the code that moves and measures."""
     folders = [Path(str(warpgarment.__file__)).parent, Path(str(kernels.__file__)).parent, Path(__file__).parent]
