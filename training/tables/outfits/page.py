@@ -54,9 +54,12 @@ def table4(results: Results) -> list[str]:
         lines += grid(headings, rows)
         for cell, what in CELLS.items():
             these = _in(here, cell)
-            lines += ["", f"### {cell}: {what}", "", _numbers(these["recording"])]
             if these["recording"]:
-                lines += ["", *_collisions(these, split_errors=True)]
+                lines += ["", f"### {cell}: {what}", "", _numbers(these["recording"]), ""]
+                lines += _collisions(these, split_errors=True)
+        empty = [f"{cell} ({what})" for cell, what in CELLS.items() if not _in(here, cell)["recording"]]
+        if empty:
+            lines += ["", f"No sequence: {'; '.join(empty)}."]
     lines += ["", "## The paper", "", "Error [mm], divided by ten as its data are ten times life size.", ""]
     lines += grid(["", *CELLS], [[name, *(_published(x) for x in values)] for name, values in TABLE4.items()])
     return [*lines, "", NOT_COMPARABLE]
@@ -118,8 +121,6 @@ def _in(results: Results, cell: str) -> Results:
 
 def _numbers(recorded: list[Rollout]) -> str:
     """How many sequences and frames there are, and how many start free of crossings."""
-    if not recorded:
-        return "No sequence."
     count, frames = len(recorded), sum(r["frames"] for r in recorded)
     splits = sorted({str(r["split"]) for r in recorded})
     shares = ", ".join(f"{sum(str(r['split']) == s for r in recorded)} {s}" for s in splits)
@@ -131,7 +132,8 @@ def _numbers(recorded: list[Rollout]) -> str:
 def _error(mean: dict[str, Any]) -> str:
     if not mean["garments"]:
         return "failed" if mean["failed"] else ""
-    return f"{mean['error_mm']:.1f}±{mean['spread_mm']:.1f}"
+    spread = f"±{mean['spread_mm']:.1f}" if mean["garments"] > 1 else ""
+    return f"{mean['error_mm']:.1f}{spread}"
 
 
 def _share(value: float) -> str:
