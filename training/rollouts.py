@@ -104,6 +104,8 @@ def predict(
     *,
     cold: bool = False,
     body: BodyMotion | None = None,
+    layers: bool | None = None,
+    apart: bool = False,
 ) -> np.ndarray:
     """Rolls a sequence out from its recorded frames.
 
@@ -114,6 +116,9 @@ def predict(
         steps: Number of frames to predict; frame `newest + steps` of the body must exist.
         cold: Whether that frame is the only recorded frame that is an input.
         body: The body of the sequence, `sequence.body()`, if the caller has it already.
+        layers: Whether garments are kept from crossing each other and themselves. None: no, and a network that reads
+            neither materials nor wind gets all garments as one mesh; otherwise each garment is an entry of its own.
+        apart: Whether each garment is alone on a body of its own, so that a network for outfits sees no other garment.
 
     Returns:
         Vertices of frames newest+1 .. newest+steps [m], float32 [steps,V,3]; NaN after a rollout that failed.
@@ -138,8 +143,8 @@ def predict(
     with warnings.catch_warnings():  # a rollout that fails is visible in the figures
         warnings.simplefilter("ignore", RuntimeWarning)
         worn = getattr(sequence, "layers", ())
-        if len(worn) > 1 or (worn and reads):  # each garment by itself, as in other simulations
-            moved = _outfit(simulator, cast(RecordedOutfit, sequence), part, first, start, known)
+        if layers is not None or apart or len(worn) > 1 or (worn and reads):  # each garment by itself
+            moved = _outfit(simulator, cast(RecordedOutfit, sequence), part, first, start, known, bool(layers), apart)
         else:
             moved = simulator.rollout(sequence.garment, part, first_vertices=start, history=known).vertices
     predicted = np.full((steps, *sequence.vertices.shape[1:]), np.nan, np.float32)
@@ -155,8 +160,10 @@ def _outfit(
     first: int,
     start: np.ndarray | None,
     known: np.ndarray | None,
+    layers: bool,
+    apart: bool,
 ) -> np.ndarray:
-    """Rolls an outfit out garment by garment, with its materials and wind if the network reads them; the arguments are
+    """Rolls an outfit out garment by garment, with the materials and the wind that the network reads; the arguments are
     those of `predict`.
 
     Returns:
@@ -166,11 +173,12 @@ def _outfit(
     reads, wind = simulator.network.reads, sequence.wind
     motions = simulator.rollout(
         list(sequence.worn),
-        body,
+        [BodyMotion(body.vertices, body.faces, body.fps) for _ in parts] if apart else body,
         first_vertices=None if start is None else [start[part] for part in parts],
         history=None if known is None else [known[:, part] for part in parts],
+        layers=True if layers else None,
         materials=list(sequence.materials) if "materials" in reads else None,
-        wind=None if wind is None or "wind" not in reads else wind[first : first + len(body.vertices)],
+        wind=wind[first : first + len(body.vertices)] if "wind" in reads and wind is not None else None,
     )
     moved = np.full((body.frames, len(sequence.garment.vertices), 3), np.nan, np.float32)
     for part, motion in zip(parts, motions, strict=True):

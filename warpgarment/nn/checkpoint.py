@@ -185,7 +185,7 @@ def shipped() -> dict[str, Path]:
 def shipped_reads() -> dict[str, frozenset[str]]:
     """The optional inputs that each network that ships reads (`GarmentNetwork.reads`), by name."""
     found = {}
-    for name, place in sorted(_shipped().items()):
+    for name, place in sorted(shipped().items()):
         with torch.device("meta"):  # only its settings are read
             found[name] = build_network(read_metadata(place)[0]).reads
     return found
