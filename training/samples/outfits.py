@@ -227,11 +227,7 @@ class OutfitBuilder:
 
         sample_of_garment = send(sample)
         sample_of_vertex = sample_of_garment[packed.garment_of_vertex.long()]
-        frames, body, delta = (
-            torch.cat(past, dim=1),
-            send(np.concatenate(bodies, axis=1)),
-            np.concatenate(deltas, axis=1),
-        )
+        recorded, body = torch.cat(past, dim=1), send(np.concatenate(bodies, axis=1))
         skin = bind(
             np.concatenate([cloth for cloth, _ in bound]),
             np.repeat(np.arange(len(mine)), [len(cloth) for cloth, _ in bound]),
@@ -242,12 +238,14 @@ class OutfitBuilder:
         moved = send(np.concatenate(deltas, axis=1))
         if any(towards):
             newest, share = self.ahead + 2, send(np.array(towards, np.float32))[sample_of_vertex][:, None]
-            moved = moved + torch.stack([share * (skin(body[k])[1] - frames[k]) for k in range(newest, newest - 3, -1)])
+            moved = moved + torch.stack(
+                [share * (skin(body[k])[1] - recorded[k]) for k in range(newest, newest - 3, -1)]
+            )
         return OutfitBatch(
             packed=packed,
             bodies=packed_bodies,
             layout=self.network.layout(garments, packed),
-            frames=frames,
+            frames=recorded,
             body=body,
             skin=skin,
             wind=send(np.concatenate(wind, axis=1).astype(np.float32)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from reference.skin import smooth_skin
+from reference.features import smooth_skin
 from scipy.spatial.transform import Rotation
 from support import meshes
 

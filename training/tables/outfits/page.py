@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 from warpgarment.training.tables.report import grid
@@ -77,7 +78,7 @@ def table5(results: Results) -> list[str]:
         known += sorted({c for r in recorded for c in r["garments"]} - set(known))
         rows = []
         for name, rollouts in here.items():
-            cells = [_error(means(rollouts, lambda k, of, c=c: of[k] == c)) for c in known]
+            cells = [_error(means(rollouts, partial(_is, c))) for c in known]
             rows.append([escape(name), *cells, _error(means(rollouts)), _share(beside(rollouts, here["skinned"]))])
         counts = [sum(r["garments"].count(c) for r in recorded) for c in known]
         headings = [f"{escape(CATEGORIES.get(c, c))} ({n})" for c, n in zip(known, counts, strict=True)]
@@ -142,3 +143,7 @@ def _share(value: float) -> str:
 
 def _published(value: tuple[float, float]) -> str:
     return f"{value[0] / 10:.1f}±{value[1] / 10:.1f}"
+
+
+def _is(category: str, garment: int, of: list[str]) -> bool:
+    return of[garment] == category

@@ -1,7 +1,7 @@
 """One dress in three fabrics and three winds, by a network and beside it by the teacher.
 
-    python -m benchmarks.fabrics_and_winds --network out/fast_outdoor/best.safetensors --out DIR
-    python -m benchmarks.fabrics_and_winds --network ... --out DIR --teacher blender    # with the teacher's rows
+    python -m benchmarks.pictures.fabrics_and_winds --network out/fast_outdoor/best.safetensors --out DIR
+    python -m benchmarks.pictures.fabrics_and_winds --network ... --out DIR --teacher blender  # and the teacher's
 
 The bundled dress on the bundled walking body, from the same positions. DIR gets `fabrics_and_winds.png` with a row for
 each fabric and a column for each wind at the last frame, and `fabrics_and_winds.json` with the mean shift of the cloth
