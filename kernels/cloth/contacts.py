@@ -221,13 +221,15 @@ class Contacts:
     Attributes:
         model: The pairs as an argument of kernels.
         normal, weights_p, weights_q: float32 [M,K,3], see above.
+        sums: Pushes of each vertex, times their weights, and the weights, int32 [V,4] in units of `UNIT`; zero outside
+            of a round.
     """
 
     def __init__(self, pairs: FacePairs, vertex_count: int, *, thickness: float, rounds: int) -> None:
         self.pairs, self.thickness, self.rounds = pairs, thickness, rounds
         device = pairs.partners.device
         self.normal, self.weights_p, self.weights_q = allocate((3, *pairs.partners.shape, 3), torch.float32, device)
-        self._sums = torch.zeros((vertex_count, 4), dtype=torch.int32, device=device)
+        self.sums = torch.zeros((vertex_count, 4), dtype=torch.int32, device=device)
         outfits = pairs.outfits
         self.model = Pairs()
         for name, tensor, kind in (
@@ -262,7 +264,7 @@ class Contacts:
         points = end.clone()
         at_start, at_end, moved = (as_argument(tensor, wp.vec3) for tensor in (start, end, points))
         found = [as_argument(tensor, wp.vec3) for tensor in (self.normal, self.weights_p, self.weights_q)]
-        sums = as_argument(self._sums, wp.int32)
+        sums = as_argument(self.sums, wp.int32)
         with torch_stream(device) as warp_device:
             for _ in range(self.rounds):
                 wp.launch(

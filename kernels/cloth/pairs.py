@@ -72,6 +72,12 @@ def share_a_vertex(a: wp.vec3i, b: wp.vec3i) -> bool:
     return found
 
 
+@wp.func
+def keeps(m: int, o: int) -> bool:
+    """Whether face m keeps its pair with face o, which it does for about half of them; else o does."""
+    return m != o and (m < o) == ((m + o) % 2 == 0)
+
+
 @wp.kernel(enable_backward=False)
 def pairs_kernel(
     # Model:
@@ -87,14 +93,14 @@ def pairs_kernel(
     partners: wp.array2d[wp.int32],
     count: wp.array[wp.int32],
 ):
-    """Partners of face m with a higher number; those beyond the room are counted, but not kept."""
+    """Partners of face m of which it keeps the pair; those beyond the room are counted, but not kept."""
     m = wp.tid()
     found = wp.int32(0)
     if lower[m][0] < NOWHERE:
         query = wp.bvh_query_aabb(tree, lower[m], upper[m], wp.bvh_get_group_root(tree, outfit[m]))
         other = wp.int32(0)
         while wp.bvh_query_next(query, other):
-            if other > m and (itself or garment[other] != garment[m]) and lower[other][0] < NOWHERE:
+            if keeps(m, other) and (itself or garment[other] != garment[m]) and lower[other][0] < NOWHERE:
                 if garment[other] != garment[m] or not share_a_vertex(faces[m], faces[other]):
                     if found < partners.shape[1]:
                         partners[m, found] = other

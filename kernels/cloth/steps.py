@@ -32,7 +32,7 @@ from .contacts import Contacts, Pairs, kept_pairs
 from .triangles import TOUCHING, corners, gap_along, separating
 
 SAFE = wp.constant(5.0e-4)
-"""Gap [m] that a pair keeps, or nine tenths of what it has at the start if that is less."""
+"""Gap [m] that a pair keeps; if it has less at the start, nine tenths of what it has there beyond `TOUCHING`."""
 SLOPE = wp.constant(0.34)
 """By how much α may differ between the corners of a face."""
 SHRINK = (0.5, 0.5, 0.4, *[0.0] * 13)
@@ -54,7 +54,7 @@ def one_axis(p0: wp.mat33, q0: wp.mat33, p: wp.mat33, q: wp.mat33, axis: wp.vec3
     if length > 0.0:
         n = axis / length
         before = gap_along(p0, q0, n)
-        found = before > TOUCHING and gap_along(p, q, n) > wp.min(SAFE, 0.9 * before)
+        found = before > TOUCHING and gap_along(p, q, n) > wp.min(SAFE, TOUCHING + 0.9 * (before - TOUCHING))
     return found
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from trimesh.triangles import closest_point
 
 TOUCHING, SAFE, SLOPE, INNER, INSIDE = 2e-6, 5e-4, 0.34, 0.3, 0.9
+ONE_MOVE, MOST = 0.004, 4.0
 
 
 def on_segment(p, a, b):
@@ -56,7 +57,7 @@ def separating(p, q):
 
 
 def pairs(start, end, faces, garment, outfit, itself, moving, margin) -> set[tuple[int, int]]:
-    """Pairs (m, o), m < o, whose boxes overlap."""
+    """Pairs (m, o), m keeping the pair, whose boxes overlap."""
     both = np.concatenate([start[faces], end[faces]], axis=1).astype(np.float64)
     low, high = both.min(1) - margin, both.max(1) + margin
     found = set()
@@ -66,7 +67,7 @@ def pairs(start, end, faces, garment, outfit, itself, moving, margin) -> set[tup
         if garment[m] == garment[o] and (not itself or set(faces[m]) & set(faces[o])):
             continue
         if (low[m] <= high[o]).all() and (low[o] <= high[m]).all():
-            found.add((m, o))
+            found.add((m, o) if keeper(m, o) == m else (o, m))
     return found
 
 
@@ -106,10 +107,7 @@ def pushed(start, end, faces, garment, rank, found, thickness, rounds, margin):
                 amount = missing / (share * weights[k] ** 2).sum()
                 np.add.at(sums, corner, (weights[k] * share * signed * amount)[:, None] * normal[k])
                 np.add.at(total, corner, weights[k])
-        moved = points + sums / np.maximum(total, 1e-300)[:, None]
-        room = INSIDE * margin
-        moved = np.clip(moved, np.minimum(start, end) - room, np.maximum(start, end) + room)
-        points = np.where(total[:, None] > 0, moved, points)
+        points = limited(points, sums, total, start, end, margin)
     return points
 
 
@@ -118,7 +116,7 @@ def one_axis(p0, q0, p, q, axis):
     length = np.linalg.norm(axis, axis=1)
     n = axis / np.maximum(length, 1e-300)[:, None]
     before = gap(p0, q0, n)
-    return (length > 0) & (before > TOUCHING) & (gap(p, q, n) > np.minimum(SAFE, 0.9 * before))
+    return (length > 0) & (before > TOUCHING) & (gap(p, q, n) > np.minimum(SAFE, TOUCHING + 0.9 * (before - TOUCHING)))
 
 
 def safe(start, points, faces, m, o, normal):
@@ -127,6 +125,43 @@ def safe(start, points, faces, m, o, normal):
     now = separating(p, q)
     found = one_axis(p0, q0, p, q, normal) | (gap(p, q, normal) > SAFE)
     return found | (now.any(1) & (one_axis(p0, q0, p, q, now) | one_axis(p0, q0, p, q, now + normal)))
+
+
+def keeper(m, o):
+    """Which of two faces keeps their pair."""
+    return min(m, o) if (m + o) % 2 == 0 else max(m, o)
+
+
+def parted(start, end, points, faces, garment, rank, found, normal, rounds, margin):
+    """Positions after pairs that are not safe were parted, [V,3]."""
+    m, o = np.array(sorted(found)).T
+    apart, points = normal.any(1), points.copy()
+    kept = np.minimum(2 * SAFE, gap(start[faces[m]], start[faces[o]], normal))
+    for _ in range(rounds):
+        sums, total = np.zeros_like(points), np.zeros(len(points))
+        for k in np.flatnonzero(apart & ~safe(start, points, faces, m, o, normal)):
+            p, q, n = points[faces[m[k]]] @ normal[k], points[faces[o[k]]] @ normal[k], normal[k]
+            first, second = rank[garment[m[k]]], rank[garment[o[k]]]
+            s, t = INNER if first < second else 1.0, INNER if second < first else 1.0
+            missing = kept[k] - (p.min() - q.max())
+            moves = (
+                np.maximum(p.min() + missing * s / (s + t) - p, 0),
+                np.maximum(q - (q.max() - missing * t / (s + t)), 0),
+            )
+            for face, move, sign in ((faces[m[k]], moves[0], 1), (faces[o[k]], moves[1], -1)):
+                weight = np.minimum(move / ONE_MOVE, MOST)
+                np.add.at(sums, face, (sign * weight * move)[:, None] * n)
+                np.add.at(total, face, weight)
+        points = limited(points, sums, total, start, end, margin)
+    return points
+
+
+def limited(points, sums, total, start, end, margin):
+    """Points moved by the means of pushes, inside the boxes of their motion."""
+    moved = points + sums / np.maximum(total, 1e-300)[:, None]
+    room = INSIDE * margin
+    moved = np.clip(moved, np.minimum(start, end) - room, np.maximum(start, end) + room)
+    return np.where(total[:, None] > 0, moved, points)
 
 
 def safe_steps(start, end, faces, outfit, found, normal, shrinks):

@@ -21,9 +21,10 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     origin = scene.contact.origin(before, features)
     meets = scene.meet.on
     pushed, finite, depth, report = scene.contact(solved, next_body, finite & now.finite, origin, measure=not meets)
-    pushed, meeting = scene.meet(before, pushed, features, finite)
+    meeting = now.meeting
     if meets:
-        depth = torch.where(finite, scene.contact.depth(pushed, next_body), depth)
+        pushed, meeting, deep = scene.meet(before, pushed, features, next_body, finite, origin)
+        depth = torch.where(finite, deep, depth)
     after, finite, depth = scene.correct(before, pushed, next_body, finite, depth)
     history = now.history.followed(stacked, scene.centroids(after) - scene.centroids(before))
     solves = torch.stack([scene.reconstruct.summary(), report])

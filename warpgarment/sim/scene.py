@@ -144,7 +144,7 @@ class Scene:
             passes=collision_passes,
             timings=timings,
         )
-        self.meet = Meet(packed, layers, first_vertices, timings)
+        self.meet = Meet(packed, layers, first_vertices, self.contact, timings)
         self.correct = Correct(self.correctors, packed, self.contact.depth, timings)
 
     def _refuse_far(self, vertices: torch.Tensor, body_of_vertex: torch.Tensor) -> None:
