@@ -127,6 +127,25 @@ def safe(start, points, faces, m, o, normal):
     return found | (now.any(1) & (one_axis(p0, q0, p, q, now) | one_axis(p0, q0, p, q, now + normal)))
 
 
+def freed(start, faces, garment, rank, found, normal, rounds, least):
+    """Normals of the pairs, zero for those that are set free around crossings of layers."""
+    order, normal = sorted(found), normal.copy()
+    area = np.cross(start[faces[:, 1]] - start[faces[:, 0]], start[faces[:, 2]] - start[faces[:, 0]])
+    area /= np.linalg.norm(area, axis=1)[:, None]
+    layers = [k for k, (m, o) in enumerate(order) if garment[m] != garment[o]]
+    marked = {int(i) for k in layers if not normal[k].any() for i in faces[list(order[k])].ravel()}
+    for _ in range(rounds):
+        near = set(marked)
+        for k in layers:
+            m, o = order[k]
+            if normal[k].any() and near & set(faces[[m, o]].ravel().tolist()) and area[m] @ area[o] > 0:
+                way = normal[k] if rank[garment[m]] > rank[garment[o]] else -normal[k]
+                if way @ (area[m] + area[o]) < least * np.linalg.norm(area[m] + area[o]):
+                    normal[k] = 0.0
+                    marked |= set(faces[[m, o]].ravel().tolist())
+    return normal
+
+
 def keeper(m, o):
     """Which of two faces keeps their pair."""
     return min(m, o) if (m + o) % 2 == 0 else max(m, o)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import igl
 import ipctk
 import numpy as np
 import pytest
@@ -100,6 +101,33 @@ def test_a_start_that_crosses_is_told():
     assert first[0].layer_crossings == first[1].layer_crossings > 10
     assert first[0].verdict is Verdict.CROSSING
     assert "layers" in first[0].message
+
+
+@pytest.mark.parametrize("depth", [0.01, 0.02])
+def test_a_start_that_crosses_is_put_in_order(depth):
+    """A jacket pushed into a dress would stay there for the whole motion. Its front is pushed `depth` through the
+    inner layer; by ipctk nothing crosses after ten frames, and every vertex of the outer layer is outside the inner
+    one. The status counts down to 0 and stays there."""
+    inner, outer = layered()
+    way = np.clip(1 - (np.linalg.norm(outer.vertices - [0.0, 0.0, 0.25], axis=1) / 0.15) ** 2, 0, None)
+    pushed = outer.vertices - np.float32(depth + 0.012) * np.sqrt(way)[:, None] * np.float32([0, 0, 1])
+    first = [inner.vertices, pushed.astype(np.float32)]
+    garments = [inner, outer]
+    assert crosses(garments, first)
+    with pytest.warns(RuntimeWarning, match="cross in the first frame"):
+        motions = simulator(network()).rollout(garments, walk(14), first_vertices=first, layers=True)
+    assert motions[0].status[0].layer_crossings > 8
+    assert [m.status[t].layer_crossings for m in motions for t in range(10, 14)] == [0] * 8
+    for t in range(10, 14):
+        assert not crosses(garments, [m.vertices[t] for m in motions])
+        at = motions[0].vertices[t]
+        distance = igl.signed_distance(
+            motions[1].vertices[t].astype(float),
+            at.astype(float),
+            inner.faces.astype(np.int64),
+            sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
+        )[0]
+        assert distance.min() > -1e-6
 
 
 def test_a_frame_of_layers_is_decided_on_the_device(monkeypatch):

@@ -30,8 +30,9 @@ _MESSAGES = {
         "or drop squeezed parts such as hands with BodyMotion.submesh."
     ),
     Verdict.CROSSING: (
-        "Triangles of the garment cross each other or another garment of its outfit. What crosses in the first frame "
-        "goes on crossing: start from garments that lie over each other, innermost first in `layers`."
+        "Triangles of the garment cross each other or another garment of its outfit. Layers that cross in the first "
+        "frame are moved apart, if `layers` has them innermost first; a garment that crosses itself goes on crossing. "
+        "Start from garments that lie over each other."
     ),
     Verdict.NOT_FINITE: (
         "The garment holds NaN or infinite positions from this frame on. Check that the garment and the body are in "

@@ -154,14 +154,15 @@ def outfits(layers: Layers, body_of_garment: Sequence[int]) -> list[list[int]]:
 
 
 def warn_of_crossing_start(garments: Sequence[Garment], first: Sequence[RolloutStatus]) -> None:
-    """Warns by name of garments that cross in the first frame; what crosses there is not kept apart later."""
+    """Warns by name of garments that cross in the first frame; only layers are moved apart later."""
     for number, (garment, status) in enumerate(zip(garments, first, strict=True)):
         layers, itself = status.layer_crossings or 0, status.self_crossings or 0
         if layers or itself:
             warnings.warn(
                 f"{layers:,} pairs of triangles of {garment.name or f'garment {number}'} and other garments of its "
-                f"outfit, and {itself:,} of its own, cross in the first frame. They will not be kept apart. Start from "
-                "garments that lie over each other, innermost first in layers",
+                f"outfit, and {itself:,} of its own, cross in the first frame. Layers are moved apart over the next "
+                "frames, a garment that crosses itself is not. Start from garments that lie over each other, innermost "
+                "first in layers",
                 RuntimeWarning,
                 stacklevel=4,
             )

@@ -11,6 +11,7 @@ from tests.reference import cloth as reference
 from warpgarment.kernels.cloth.contacts import Contacts
 from warpgarment.kernels.cloth.crossings import crossings
 from warpgarment.kernels.cloth.newly import newly_crossing
+from warpgarment.kernels.cloth.order import LEAST, ROUNDS, set_free
 from warpgarment.kernels.cloth.pairs import MARGIN, FacePairs
 from warpgarment.kernels.cloth.parting import parted
 from warpgarment.kernels.cloth.steps import SHRINK, safe_steps
@@ -216,3 +217,26 @@ def test_only_new_crossings_call_for_another_start(monkeypatch):
     assert newly_crossing(contacts, free, 2).tolist() == [True, False]
     assert newly_crossing(contacts, torch.from_numpy(case.start), 2).tolist() == [False, False]
     assert newly_crossing(Case(0).contacts(), free, 2).tolist() == [False, False]
+
+
+def test_pairs_around_crossings_are_set_free(monkeypatch):
+    """A crossing would be kept by the faces around it, or what is far from it lose its side. The twin sets the same
+    pairs free; without a crossing none. The outer tube is pushed into the inner one from one side."""
+    poison_outputs(monkeypatch)
+    case = Case(5, at_start=0.0, itself=False)
+    outer = np.flatnonzero((case.of_vertex == 0) & (np.arange(len(case.start)) >= case.faces[case.garment == 1].min()))
+    free = case.contacts(partners=300)
+    before = free.normal.clone()
+    set_free(free, case.tensors()[0], 2)
+    kept = torch.arange(300)[None] < free.pairs.count[:, None]
+    assert torch.equal(free.normal[kept], before[kept])
+    near = np.linalg.norm(case.start[outer] - case.start[outer].mean(0) - [0.115, 0, 0], axis=1) < 0.1
+    case.start[outer[near]] -= np.float32([0.03, 0, 0])
+    contacts = case.contacts(partners=300)
+    found, normal = case.of_twin(contacts)
+    twin = reference.freed(case.start.astype(float), case.faces, case.garment, case.rank, found, normal, ROUNDS, LEAST)
+    for early_exit in (False, True):
+        set_free(contacts, case.tensors()[0], 2, early_exit=early_exit)
+        freed = case.of_twin(contacts)[1]
+        assert np.array_equal(freed.any(1), twin.any(1))
+    assert 10 < (normal.any(1) & ~freed.any(1)).sum() < 0.5 * len(normal)

@@ -6,7 +6,8 @@ pushed apart (`kernels/cloth/contacts.py`, `parting.py`), and vertices go as far
 they stay behind, the step is repeated from where they got, with the directions of pairs found there. Cloth that is then
 deep in the body, since layers held it or pushed it there, is moved out by another contact with the body, whose result
 is the end of another step: so layers stay in their order, and cloth may stay in the body where both cannot be had. What
-crosses in the result is counted, and so is how far vertices stayed behind.
+crosses in the result is counted, and so is how far vertices stayed behind. Where layers cross at the start, faces
+around the crossing are pushed to the sides that the order of the layers gives them (`order.py`).
 
 What was free stays free. Where the carried start crosses and the last frame did not, the outfit is carried by an affine
 motion, which cannot make anything cross, and goes from there towards the smooth one as far as nothing crosses. The
@@ -25,6 +26,7 @@ import torch
 from warpgarment.kernels.cloth.contacts import Contacts
 from warpgarment.kernels.cloth.crossings import Crossings, crossings
 from warpgarment.kernels.cloth.newly import newly_crossing
+from warpgarment.kernels.cloth.order import set_free
 from warpgarment.kernels.cloth.pairs import MARGIN, FacePairs, Outfits
 from warpgarment.kernels.cloth.parting import parted
 from warpgarment.kernels.cloth.steps import Steps, safe_steps
@@ -221,6 +223,7 @@ class Meet:
         if not found:
             self._pairs.margin = WIDE
             self._find(start, end, finite & active[self._outfit.long()])
+        set_free(self._contacts, start, self._count, early_exit=self.early_exit)
         wanted = self._contacts.pushed(start, end)
         wanted = parted(self._contacts, start, end, wanted, self._count, rounds=PARTINGS, early_exit=self.early_exit)
         reached = self._safe(start, wanted).positions
