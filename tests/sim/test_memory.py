@@ -109,6 +109,24 @@ def test_prediction(garments, config, options):
     assert 1 / FACTOR < ratio < FACTOR, f"{predicted}, measured {measured / 1e6:.1f} MB"
 
 
+@pytest.mark.parametrize("garments", [[ONE, ONE], MANY, [MANY[1]] * 3])
+def test_prediction_of_layers(garments):
+    """Pairs of faces would be left out, and an outfit fill the memory. What layers add to the most that is allocated is
+    within a factor of 1.5 of the entry."""
+    motion, layers = walk(2), [list(range(len(garments)))]
+    sim = Simulator(build_network(FAST), "cpu")
+
+    def run(layers):
+        state = sim.start(garments, motion.vertices[0], motion.faces, layers=layers)
+        sim.step(state, motion.vertices[1])
+
+    run(None)  # what is allocated once and kept
+    needed = allocated(lambda: run(layers)) - allocated(lambda: run(None))
+    predicted = memory.predict(garments, [motion], FAST, layers=layers).parts["pairs of layers"]
+    assert memory.predict(garments, [motion], FAST).parts["pairs of layers"] == 0
+    assert 1 / FACTOR < predicted / needed < FACTOR, f"{predicted / 1e6:.1f} MB, measured {needed / 1e6:.1f} MB"
+
+
 def test_batches_that_do_not_fit(monkeypatch):
     """The system would kill the process, or CUDA fail somewhere in the middle. What the message advises must fit."""
     garments = [garment(20, 13) for _ in range(8)]
