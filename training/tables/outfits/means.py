@@ -46,7 +46,7 @@ def beside(rollouts: list[Rollout], others: list[Rollout]) -> float:
     if not both:
         return math.nan
     ours, theirs = (np.concatenate(errors).mean() for errors in zip(*both, strict=True))
-    return float(ours / theirs)
+    return float(ours / theirs) if theirs > 0.0 else math.nan
 
 
 def _mean(values: list[float]) -> float:

@@ -33,6 +33,7 @@ from .crossings import crossing_pairs
 from .figures import Outfit, rollout_figures
 from .rows import Row, Start
 
+MEASURING = ("collisions", "crossings", "figures", "measuring", "rows", "static")  # modules beside this one
 Mover = Callable[[Sequence, BodyMotion, Start, int], np.ndarray]
 
 
@@ -152,8 +153,9 @@ def measured(mover: Mover, case: Case, start: Start, steps: int) -> dict[str, An
 @functools.cache
 def code_checksum() -> str:
     """Checksum of the code that moves and measures."""
-    folders = [Path(str(warpgarment.__file__)).parent, Path(str(kernels.__file__)).parent, Path(__file__).parent]
+    folders = [Path(str(warpgarment.__file__)).parent, Path(str(kernels.__file__)).parent]
     files = [file for folder in folders for file in folder.rglob("*.py")] + [Path(rollouts.__file__)]
+    files += [Path(__file__).with_name(f"{name}.py") for name in MEASURING]
     digest = hashlib.sha256()
     for file in sorted(set(files)):
         digest.update(file.name.encode() + file.read_bytes())
