@@ -32,14 +32,13 @@ from warpgarment.objects.material import Material
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.rollouts import check_rate, predict, skinned
+from warpgarment.training.tables.options import DataLacks, OptionMissing
+from warpgarment.training.tables.pictures import axes_of, save
+from warpgarment.training.tables.protocol import STARTS, evenly
+from warpgarment.training.tables.report import grid, publish
 from warpgarment.training.train.training_set import folders_of, reason_of
 from warpgarment.view import draw
 from warpgarment.view.markdown import escape
-
-from .options import DataLacks, OptionMissing
-from .pictures import axes_of, save
-from .protocol import STARTS, evenly
-from .report import grid, publish
 
 RIGHT, SKINNED = "right", "skinned"
 NOTE = (
