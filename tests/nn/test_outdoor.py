@@ -12,6 +12,7 @@ from safetensors import safe_open
 from scipy.spatial.transform import Rotation
 from support.scenes import outfit, skirt, tube, walk
 
+from benchmarks.frames import FrameCounts
 from warpgarment.errors import CheckpointError
 from warpgarment.kernels.features.channels import FACE, FEATURES, OUTDOOR
 from warpgarment.nn import checkpoint
@@ -27,6 +28,8 @@ from warpgarment.nn.run import mirror_inputs, mirror_output, rotate_output, run
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
+from warpgarment.sim import graph
+from warpgarment.sim import simulator as simulator_module
 from warpgarment.sim.simulator import Simulator
 
 TINY = {"embedding": 16, "layers": 1, "feed_forward": 16, "heads": 2, "manifold_heads": 1, "history": 3, "dropout": 0.0}
@@ -234,6 +237,45 @@ def test_by_steps(kind):
     for frame in range(1, 6):
         state = simulator.step(state, body.vertices[frame], wind=wind[frame])
         assert np.array_equal(state.vertices, expected[frame])
+
+
+@every_kind
+def test_no_number_is_looked_at_within_a_frame(kind):
+    """The host would wait for a GPU in the middle of a frame, and a graph of it could not be recorded."""
+    body, simulator = walk(3), Simulator(made(kind), "cpu")
+    state = simulator.start([skirt(), outfit()], body.vertices[0], body.faces, materials=[SILK, None], wind=GALE)
+    state = simulator.step(state, body.vertices[1])
+    assert FrameCounts(state.scene, state.now, torch.from_numpy(body.vertices[2])).reads == []
+
+
+@every_kind
+def test_replays_are_the_frames(kind, monkeypatch):
+    """The wind, the frame before or the materials of a replayed frame would be those of the recording. Bit for bit."""
+
+    def again(call):
+        """A recording for the CPU: its replay runs the frame once more, on the same memory."""
+        after = call()
+
+        def replay():
+            for held, new in zip(after, call(), strict=True):
+                held.copy_(new.clone())
+
+        return after, replay
+
+    network, garments, body = made(kind), [skirt(), outfit()], walk(9)
+    wind = np.random.default_rng(0).normal(scale=3.0, size=(9, 2, 3))
+    options = {"materials": [SILK, None], "wind": wind}
+    plain = Simulator(network, "cpu").rollout(garments, body, **options)
+    recorded, graphed = [], graph.GraphedFrames
+    monkeypatch.setattr(
+        simulator_module, "GraphedFrames", lambda scene: recorded.append(graphed(scene, again)) or recorded[-1]
+    )
+    replaying = Simulator(network, "cpu")
+    replaying.graph = True
+    found = replaying.rollout(garments, body, **options)
+    assert recorded[0].recorded
+    for one, other in zip(plain, found, strict=True):
+        assert np.array_equal(one.vertices, other.vertices)
 
 
 def test_networks_that_do_not_read_them_refuse_them():

@@ -29,7 +29,7 @@ MAKERS = {
     "figure12": "groups",
     "category": "groups",
     "long": "long",
-    "outdoor": "outfits.outdoor",
+    "outdoor": "outdoor.table",
 }
 
 

@@ -20,7 +20,7 @@ from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.evaluate.measure import EvaluateConfig, evaluate
 from warpgarment.training.rollouts import predict
 from warpgarment.training.tables.options import DataLacks, OptionMissing, TableOptions
-from warpgarment.training.tables.outfits.outdoor import Case, permuted, summary
+from warpgarment.training.tables.outdoor.table import Case, permuted, summary
 
 CLOTH = [Material(density=0.1 * (k + 1), bend=10.0 ** -(k + 1)) for k in range(4)]
 

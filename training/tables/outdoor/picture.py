@@ -1,12 +1,12 @@
 """One dress in three fabrics and three winds, by a network and beside it by the teacher.
 
-    python -m benchmarks.pictures.fabrics_and_winds --network out/fast_outdoor/best.safetensors --out DIR
-    python -m benchmarks.pictures.fabrics_and_winds --network ... --out DIR --teacher blender  # and the teacher's
+    python -m warpgarment.training.tables.outdoor.picture --network NETWORK --out DIR
+    python -m warpgarment.training.tables.outdoor.picture --network NETWORK --out DIR --teacher blender
 
-The bundled dress on the bundled walking body, from the same positions. DIR gets `fabrics_and_winds.png` with a row for
-each fabric and a column for each wind at the last frame, and `fabrics_and_winds.json` with the mean shift of the cloth
-against still air in the last half of the frames [cm]. The teacher's frames are kept in DIR/teacher, and used again as
-long as the scene and the teacher's settings stay the same.
+Only the second command has the teacher's rows. The bundled dress on the bundled walking body, from the same positions.
+DIR gets `fabrics_and_winds.png` with a row for each fabric and a column for each wind at the last frame, and
+`fabrics_and_winds.json` with the mean shift of the cloth against still air in the last half of the frames [cm]. The
+teacher's frames are kept in DIR/teacher, and used again as long as the scene and the teacher's settings stay the same.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def by_teacher(name: str, frames: int, kept: Path) -> dict[Key, np.ndarray]:
             place = kept / f"{hashlib.sha256(about.encode()).hexdigest()[:16]}.npz"
             if not place.exists():
                 cloth = Cloth(item.garment, edge, np.asarray(item.first_vertices, np.float32), material)
-                body, air = bundle.collider, np.tile(np.float32(velocity), (frames, 1))
+                body, air = bundle.collider, np.tile(np.array(velocity, np.float32), (frames, 1))
                 scene = ClothScene((cloth,), body.vertices[:frames], body.faces, fps=body.fps, wind=air)
                 simulated = np.stack(list(teacher.simulate(scene)))
                 kept.mkdir(parents=True, exist_ok=True)
@@ -89,7 +89,7 @@ def figures(found: dict[Key, np.ndarray]) -> list[dict[str, Any]]:
     calm, rows = next(iter(WINDS)), []
     for (fabric, wind), vertices in found.items():
         half = len(vertices) // 2
-        shift = 100.0 * (vertices[half:] - found[fabric, calm][half:]).mean(axis=(0, 1))
+        shift = 100.0 * (vertices[half:] - found[fabric, calm][half:]).mean(axis=(0, 1), dtype=np.float64)
         rows.append({"fabric": fabric, "wind": wind, "shift_cm": shift.tolist()})
     return rows
 
@@ -113,14 +113,14 @@ def picture(path: Path, by: dict[str, dict[Key, np.ndarray]]) -> None:
     draw.write_png(path, np.concatenate(strips, axis=0))
 
 
-def main() -> None:
-    """Simulates, measures and draws."""
+def main(arguments: list[str] | None = None) -> None:
+    """Simulates, measures and draws; the arguments are those of the command line, None for the real ones."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--network", required=True)
     parser.add_argument("--teacher", choices=TEACHERS, default=None)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--out", type=Path, required=True)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     by = {"network": by_network(options.network, options.frames)}
     if options.teacher:
         by[options.teacher] = by_teacher(options.teacher, options.frames, options.out / "teacher")

@@ -1,0 +1,1 @@
+"""Materials and wind: a table of what they change, and a picture."""
