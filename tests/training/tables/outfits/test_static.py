@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from reference.skin import smooth_skin
+from reference.features import smooth_skin
 from scipy.spatial.transform import Rotation
 from support import sequences
 
