@@ -50,12 +50,13 @@ def test_garments_of_an_outfit_are_entries_of_their_own(tmp_path, cold):
 
 def test_garments_apart_do_not_see_each_other(tmp_path):
     """The row with garments apart would be the LayersNet with layers under another name: each garment alone, with its
-    material and the wind, gives the same to 1e-6 m; together they move otherwise."""
+    material and the wind, gives the same to 1e-5 m, which float32 products of other sizes come to with random weights;
+    together they move otherwise."""
     sequence = Sequence.load(sequences.write_outfit(tmp_path, "one", frames=6, wide=1.1))
     made, body = simulator(layersnet(patch_radius=0.3)), sequence.body()
     apart = predict(made, sequence, 2, 3, apart=True)
     for k, (garment, layer) in enumerate(zip(sequence.worn, sequence.layers, strict=True)):
         known, own = np.array(sequence.vertices[:3, layer.vertices]), [sequence.materials[k]]
         alone = made.rollout([garment], body, history=[known], materials=own, wind=sequence.wind)[0].vertices
-        np.testing.assert_allclose(apart[:, layer.vertices], alone[3:], atol=1e-6)
+        np.testing.assert_allclose(apart[:, layer.vertices], alone[3:], atol=1e-5)
     assert abs(predict(made, sequence, 2, 3) - apart).max() > 1e-4
