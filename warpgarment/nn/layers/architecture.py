@@ -51,7 +51,8 @@ class Layers(Architecture):
 
     def geometry(self, garment: Garment, config: NetworkConfig) -> ClothPatches:
         """The garment's patches."""
-        return cloth_patches(garment, config.patch_spacing)
+        assert isinstance(config, LayersNetConfig)
+        return cloth_patches(garment, config.patch_spacing, config.patches)
 
     def patch_means(self, layout: LayersLayout, positions: torch.Tensor) -> torch.Tensor:
         """Means over the vertices of each patch, [V,3] -> [P,3]."""

@@ -1,7 +1,8 @@
 """Patches of a garment as LayersNet has them: clusters of faces, and the vertices that these touch.
 
 The faces are divided by their nearest centre of the project's geodesic patches (`nn/patches/layout.py`), which are 7
-to 8 cm wide with a spacing of 5.5 cm, and 11 cm with one of 8 cm. A vertex belongs to every patch whose faces it
+to 8 cm wide with a spacing of 5.5 cm, and 11 cm with one of 8 cm; or, as in the publication, by cells in texture space
+(texture.py) if the garment has texture coordinates. A vertex belongs to every patch whose faces it
 touches; its own is the one with the nearest mean in the rest pose. A patch's state is the mean of its vertices. Mesh
 edges join patches that share a vertex, or two of whose vertices are joined by an edge of the mesh; a patch is joined to
 itself.
@@ -20,7 +21,9 @@ import torch
 from warpgarment.nn.patches.layout import garment_patches
 from warpgarment.objects.garment import Garment
 
-_known: WeakKeyDictionary[Garment, dict[float, ClothPatches]] = WeakKeyDictionary()
+from .texture import texture_cells
+
+_known: WeakKeyDictionary[Garment, dict[tuple[str, float], ClothPatches]] = WeakKeyDictionary()
 
 
 class ClothPatches(NamedTuple):
@@ -57,13 +60,21 @@ class ClothLayout(NamedTuple):
         return sums.index_add(0, self.patch, values[self.vertex] * self.share[:, None].to(values.dtype))
 
 
-def cloth_patches(garment: Garment, spacing: float) -> ClothPatches:
-    """The patches of a garment, computed once and kept; `spacing` [m] is that of `garment_patches`."""
+def cloth_patches(garment: Garment, spacing: float, by: str = "geodesics") -> ClothPatches:
+    """The patches of a garment, computed once and kept.
+
+    Args:
+        garment: The garment.
+        spacing: Spacing of the centres, as in `garment_patches`, or side of the cells [m].
+        by: "geodesics", or "texture" for cells in texture space where the garment has texture coordinates.
+    """
     mine = _known.setdefault(garment, {})
-    if spacing not in mine:
-        of_face = garment_patches(garment, spacing).patch[:, 0]
-        mine[spacing] = divided(garment.vertices, garment.faces, of_face)
-    return mine[spacing]
+    if (by, spacing) not in mine:
+        of_face = texture_cells(garment, spacing) if by == "texture" else None
+        if of_face is None:
+            of_face = garment_patches(garment, spacing).patch[:, 0]
+        mine[by, spacing] = divided(garment.vertices, garment.faces, of_face)
+    return mine[by, spacing]
 
 
 def divided(vertices: np.ndarray, faces: np.ndarray, of_face: np.ndarray) -> ClothPatches:

@@ -25,6 +25,8 @@ class LayersNetConfig(NetworkConfig):
         decoder: Width of the hidden layers of the decoder.
         carried_by: Where cloth goes before the network's accelerations are added: "body", on as it moved about its
             body, or "inertia", on as it moved in space (see inputs.py).
+        patches: How the cloth is divided: "geodesics", or "texture" for cells of `patch_spacing` in texture space, as
+            published; a garment without texture coordinates is divided by geodesics all the same.
         rotation: "orthogonal" turns hidden vectors by R_h = Q (R + R + R + R + R + 1) Q^T with an orthogonal Q;
             "published" by R_h = W R W^T of rank 3, which is no rotation (see turns.py).
         patch_radius: Largest distance between the centres of patches that a world edge joins [m].
@@ -46,6 +48,7 @@ class LayersNetConfig(NetworkConfig):
     world_heads: int = 4
     decoder: int = 128
     carried_by: str = "body"
+    patches: str = "geodesics"
     rotation: str = "orthogonal"
     patch_radius: float = 0.08
     patch_neighbours: int = 16
@@ -63,6 +66,8 @@ class LayersNetConfig(NetworkConfig):
             raise ValueError(f'rotation must be "orthogonal" or "published", got {self.rotation!r}')
         if self.carried_by not in ("body", "inertia"):
             raise ValueError(f'carried_by must be "body" or "inertia", got {self.carried_by!r}')
+        if self.patches not in ("geodesics", "texture"):
+            raise ValueError(f'patches must be "geodesics" or "texture", got {self.patches!r}')
         if self.rotation == "orthogonal" and self.head_width < 4:
             raise ValueError(f"a head must be at least 4 wide to be turned, got {self.head_width}")
         for name in ("decoder", "patch_neighbours"):
@@ -87,6 +92,7 @@ class LayersNetConfig(NetworkConfig):
             "feed_forward": 256,
             "decoder": 268,
             "rotation": "published",
+            "patches": "texture",
             "patch_spacing": 0.055,
             "patch_radius": 0.04,
             "body_radius": 0.06,

@@ -103,7 +103,7 @@ class LayersNet(GarmentNetwork):
 
     def layout(self, garments: Sequence[Garment], packed: PackedGarments, *, face_splits: int = 1) -> LayersLayout:
         """The patches of a batch, and its hash grid; `face_splits` has no effect."""
-        patches = [cloth_patches(garment, self.config.patch_spacing) for garment in garments]
+        patches = [cloth_patches(garment, self.config.patch_spacing, self.config.patches) for garment in garments]
         device = packed.faces.device
         return LayersLayout(cloth_layout(patches, device), NearestPoints(device))
 
