@@ -192,6 +192,18 @@ def test_several_steps_with_gradient(data):
     assert (long - network.decoder[-1].weight.grad).abs().max() > 1e-6
 
 
+@pytest.mark.parametrize("still", [True, False])
+def test_gradients_of_several_steps_are_finite(data, still):
+    """Training would stop at still air: its speed has no derivative at zero, and directions turn with the cloth."""
+    network = network_of().train()
+    batch = batch_of(data, network, steps=2)
+    if still:
+        batch = dataclasses.replace(batch, wind=torch.zeros_like(batch.wind))
+    PositionObjective(network, PositionConfig(), "float32")(batch)[0].backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is None or torch.isfinite(parameter.grad).all(), name
+
+
 def test_a_few_steps_lower_the_loss(data):
     """Gradients would not lead downhill. The loss of one batch falls to less than half within 20 steps."""
     network = network_of(residual=True).train()

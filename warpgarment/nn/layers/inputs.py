@@ -112,7 +112,7 @@ def seen(inputs: FrameInputs, cloth: ClothLayout, *, fps: float, canonical: bool
                     _turned(speed[k][of_garment], turn) * fps,
                     _turned(pull[k][of_garment], turn) * (fps**2 / ROOT_ACCELERATION),
                     quaternions(direction),
-                    direction.square().sum(-1, keepdim=True).sqrt() / AIR_SPEED,
+                    air[k].square().sum(-1, keepdim=True).sqrt() / AIR_SPEED,
                 ],
                 dim=1,
             )
