@@ -26,7 +26,8 @@ DEFINITIONS = (
     "further in, within 3 cm. Pairs: crossing triangles of two garments, or of one with itself, in a frame; free: "
     "frames in which no two garments cross. Collisions are "
     "means over frames, then over sequences, and come from code of their own in float64, not from the contact stage. "
-    "Means are over the sequences that stayed finite; failed: those that did not. A frame's time includes set-up."
+    "Means are over the sequences that stayed finite; failed: those that did not. A frame's time includes set-up. The "
+    "body is the part with which cloth collides, without hands and forearms."
 )
 COLLISIONS = {
     "h_published": ("H [%]", "{:.2%}"), "h_surface": ("H surface [%]", "{:.2%}"), "l_published": ("L [%]", "{:.2%}"),
