@@ -94,6 +94,14 @@ def two_layers(content: dict) -> None:
     content["wind"] = np.stack([np.linspace(0, 2, frames), np.zeros(frames), np.ones(frames)], 1).astype(np.float32)
 
 
+def write_set(root: Path, train: int = 3, validation: int = 1, test: int = 1, **settings) -> Path:
+    """Writes a data set of tubes with different seeds."""
+    names = [("train", i) for i in range(train)] + [("validation", i) for i in range(validation)]
+    for number, (split, i) in enumerate(names + [("test", i) for i in range(test)]):
+        write(root, f"{split}_{i}", split, seed=number, **settings)
+    return Path(root)
+
+
 def widened(wide: float = 1.15, wind: float = 2.0):
     """A change of a sequence's arrays: a tube `wide` times as wide over the first, in a wind of about `wind` [m/s]."""
 
@@ -114,7 +122,7 @@ def widened(wide: float = 1.15, wind: float = 2.0):
     return change
 
 
-def write_outfit(
+def write_worn(
     root: Path, name: str, split: str = "test", *, wide: float = 1.15, wind: float = 2.0, **settings
 ) -> Path:
     """Writes a sequence of an inner dress and an outer jacket, by name; returns its folder."""
@@ -123,11 +131,3 @@ def write_outfit(
         {"name": "outer", "category": "jacket", "material": Material(density=0.2).as_dict()},
     ]
     return write(root, name, split, spoil=widened(wide, wind), manifest={"garments": garments}, **settings)
-
-
-def write_set(root: Path, train: int = 3, validation: int = 1, test: int = 1, **settings) -> Path:
-    """Writes a data set of tubes with different seeds."""
-    names = [("train", i) for i in range(train)] + [("validation", i) for i in range(validation)]
-    for number, (split, i) in enumerate(names + [("test", i) for i in range(test)]):
-        write(root, f"{split}_{i}", split, seed=number, **settings)
-    return Path(root)

@@ -33,7 +33,7 @@ def test_recordings_at_another_rate_than_the_network_are_refused():
 def test_garments_of_an_outfit_are_entries_of_their_own(tmp_path, cold):
     """A network of faces would see an outfit as one mesh in the tables of outfits, or garments in another order: each
     garment rolled out by itself gives the same to 1e-6 m; with contact between garments something else."""
-    sequence = Sequence.load(sequences.write_outfit(tmp_path, "one", frames=9, wide=1.04))
+    sequence = Sequence.load(sequences.write_worn(tmp_path, "one", frames=9, wide=1.04))
     made, body = simulator(network()), sequence.body()
     together = predict(made, sequence, 3, 4, cold=cold, layers=False)
     first = 3 if cold else 1
@@ -50,9 +50,9 @@ def test_garments_of_an_outfit_are_entries_of_their_own(tmp_path, cold):
 
 def test_garments_apart_do_not_see_each_other(tmp_path):
     """The row with garments apart would be the LayersNet with layers under another name: each garment alone, with its
-    material and the wind, gives the same to 1e-5 m, which float32 products of other sizes come to with random weights;
-    together they move otherwise."""
-    sequence = Sequence.load(sequences.write_outfit(tmp_path, "one", frames=6, wide=1.1))
+    material and the wind, gives the same to 1e-5 m (2e-6 were seen in float32: other batches); together they move
+    otherwise."""
+    sequence = Sequence.load(sequences.write_worn(tmp_path, "one", frames=6, wide=1.1))
     made, body = simulator(layersnet(patch_radius=0.3)), sequence.body()
     apart = predict(made, sequence, 2, 3, apart=True)
     for k, (garment, layer) in enumerate(zip(sequence.worn, sequence.layers, strict=True)):

@@ -42,7 +42,8 @@ TITLES = {
 NOT_BUILT = (
     "MGNet is one network for one garment and has no row. GarSim has none of its own: nearest to it is a row with "
     "garments apart, a LayersNet in which each garment is alone with its body, though trained on whole outfits. The "
-    "static row is in the manner of DeePSD (training/tables/outfits/static.py), without losses against collisions."
+    "static row is in the manner of DeePSD (training/tables/outfits/static.py), without losses against collisions; it "
+    "is bound in frame 0 in windows too, while all other rows start from frame 60."
 )
 PAGE = "The commands below write this page (`--page`). layersnet.md says what differs from the publication."
 

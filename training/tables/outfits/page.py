@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 from warpgarment.training.tables.report import grid
@@ -26,7 +26,8 @@ DEFINITIONS = (
     "further in, within 3 cm. Pairs: crossing triangles of two garments, or of one with itself, in a frame; free: "
     "frames in which no two garments cross. Collisions are "
     "means over frames, then over sequences, and come from code of their own in float64, not from the contact stage. "
-    "Means are over the sequences that stayed finite; failed: those that did not. A frame's time includes set-up."
+    "Means are over the sequences that stayed finite; failed: those that did not. A frame's time includes set-up. The "
+    "body is the part with which cloth collides, without hands and forearms."
 )
 COLLISIONS = {
     "h_published": ("H [%]", "{:.2%}"), "h_surface": ("H surface [%]", "{:.2%}"), "l_published": ("L [%]", "{:.2%}"),
@@ -43,7 +44,7 @@ def table4(results: Results) -> list[str]:
         "", DEFINITIONS,
     ]  # fmt: skip
     for start, title in STARTS.items():
-        here = _of(results, lambda r, start=start: r["start"] == start)
+        here = _with(results, "start", start)
         if not any(here.values()):
             continue
         lines += ["", f"## {title}", "", "Error of all garments [mm].", ""]
@@ -70,7 +71,7 @@ def table5(results: Results) -> list[str]:
     """Table 5 by category."""
     lines = [DEFINITIONS]
     for start, title in STARTS.items():
-        here = _of(results, lambda r, start=start: r["start"] == start)
+        here = _with(results, "start", start)
         if not any(here.values()):
             continue
         recorded = here["recording"]
@@ -78,7 +79,7 @@ def table5(results: Results) -> list[str]:
         known += sorted({c for r in recorded for c in r["garments"]} - set(known))
         rows = []
         for name, rollouts in here.items():
-            cells = [_error(means(rollouts, partial(_is, c))) for c in known]
+            cells = [_error(means(rollouts, _is(category))) for category in known]
             rows.append([escape(name), *cells, _error(means(rollouts)), _share(beside(rollouts, here["skinned"]))])
         counts = [sum(r["garments"].count(c) for r in recorded) for c in known]
         headings = [f"{escape(CATEGORIES.get(c, c))} ({n})" for c, n in zip(known, counts, strict=True)]
@@ -112,12 +113,18 @@ def _collisions(results: Results, *, split_errors: bool = False) -> list[str]:
     return grid(headings, rows)
 
 
-def _of(results: Results, chosen: Any) -> Results:
-    return {name: [r for r in rollouts if chosen(r)] for name, rollouts in results.items()}
+def _with(results: Results, key: str, value: str) -> Results:
+    """The rollouts with a value, row by row."""
+    return {name: [r for r in rollouts if r[key] == value] for name, rollouts in results.items()}
 
 
 def _in(results: Results, cell: str) -> Results:
-    return _of(results, lambda r: r["cell"] == cell)
+    return _with(results, "cell", cell)
+
+
+def _is(category: str) -> Callable[[int, list[str]], bool]:
+    """Whether a garment is of a category."""
+    return lambda k, categories: categories[k] == category
 
 
 def _numbers(recorded: list[Rollout]) -> str:
@@ -143,7 +150,3 @@ def _share(value: float) -> str:
 
 def _published(value: tuple[float, float]) -> str:
     return f"{value[0] / 10:.1f}±{value[1] / 10:.1f}"
-
-
-def _is(category: str, garment: int, of: list[str]) -> bool:
-    return of[garment] == category

@@ -21,10 +21,10 @@ from warpgarment.training.tables.outfits.static import StaticGarment
 def data(tmp_path_factory) -> Path:
     """A long test sequence in wind, a short one without, one for validation, and one that is not finite."""
     root = tmp_path_factory.mktemp("worn")
-    sequences.write_outfit(root, "long", frames=98)
-    sequences.write_outfit(root, "short", frames=14, wind=0.0, wide=1.25)
-    sequences.write_outfit(root, "other", "validation", frames=5)
-    sequences.write_outfit(root, "nowhere", frames=14)
+    sequences.write_worn(root, "long", frames=98)
+    sequences.write_worn(root, "short", frames=14, wind=0.0, wide=1.25)
+    sequences.write_worn(root, "other", "validation", frames=5)
+    sequences.write_worn(root, "nowhere", frames=14)
     positions = np.load(root / "nowhere" / "garment_boxes.npy")
     positions[3] = np.nan
     np.save(root / "nowhere" / "garment_boxes.npy", positions)

@@ -108,7 +108,7 @@ def test_rows_are_compared_where_both_are_finite():
 def test_what_an_outfit_is(tmp_path, wind, cell):
     """A sequence would be in another column of table 4. The inner tube is 3 to 4 cm wider than the capsule, which has
     flat sides that are nearer; wind below 1 m/s is none. Same place at rest, same number."""
-    sequence = Sequence.load(sequences.write_outfit(tmp_path, "one", wind=wind, frames=3))
+    sequence = Sequence.load(sequences.write_worn(tmp_path, "one", wind=wind, frames=3))
     outfit = Outfit.of(sequence, sequence.body())
     assert 0.02 < outfit.ease < 0.06
     assert outfit.cell == ("L" if outfit.ease > 0.035 else "T") + cell[1:]

@@ -22,7 +22,7 @@ from warpgarment.training.tables.outfits.static_training import Recorded, train_
 def data(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("worn")
     for name, split in (("a", "train"), ("b", "train"), ("c", "validation")):
-        sequences.write_outfit(root, name, split, frames=20, seed=ord(name))
+        sequences.write_worn(root, name, split, frames=20, seed=ord(name))
     return root
 
 
@@ -98,7 +98,7 @@ def test_training_helps_and_spends_what_it_says(data, tmp_path):
 
 def test_without_training_sequences_it_says_so(tmp_path):
     """It would write an untrained model."""
-    sequences.write_outfit(tmp_path, "only", "test", frames=3)
+    sequences.write_worn(tmp_path, "only", "test", frames=3)
     with pytest.raises(DataLacks, match="no sequence to train on"):
         train_static(tmp_path, tmp_path / "static.safetensors", minutes=0.01)
     assert not (tmp_path / "static.safetensors").exists()
