@@ -15,6 +15,7 @@ from benchmarks.scenes import Dressed, dressed
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.objects.garment import Garment
 from warpgarment.sim import memory
+from warpgarment.sim.arguments import packed_on
 from warpgarment.sim.simulator import Simulator
 from warpgarment.sim.state import SimulationState
 
@@ -43,7 +44,7 @@ class Rolling:
         self.sent: list[torch.Tensor] = []
         if simulator.device.type == "cuda":
             walk = [[body.vertices[frame] for body in self.bodies] for frame in range(frames)]
-            self.sent = [simulator._positions(positions) for positions in walk]
+            self.sent = [packed_on(positions, simulator.device) for positions in walk]
 
     def __call__(self) -> None:
         """Simulates one frame."""

@@ -15,6 +15,7 @@ from benchmarks.measure import NO_GPU, Row, aimed
 from benchmarks.networks import Named
 from warpgarment.kernels.linear import progress
 from warpgarment.sim.advance import advance
+from warpgarment.sim.arguments import packed_on
 from warpgarment.sim.graph import WARM_UP
 from warpgarment.sim.simulator import Simulator
 
@@ -105,7 +106,7 @@ def _rows(faces: int, batches: Sequence[int], device: torch.device, named: Named
         scenes = scenes_of([faces], number)
         rolling = Rolling(simulator, scenes)
         rolling()
-        bodies = simulator._positions([scene.body.vertices[2] for scene in scenes])
+        bodies = packed_on([scene.body.vertices[2] for scene in scenes], simulator.device)
         counts = FrameCounts(rolling.state.scene, rolling.state.now, bodies)
         refits = counts.launches.pop("refit", 0)
         launches, reads = sum(counts.launches.values()), len(counts.reads)
