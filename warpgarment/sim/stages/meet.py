@@ -50,7 +50,7 @@ BEHIND = 0.001
 """Lag [m] from which an outfit takes another step."""
 OUT = 2
 """Most steps out of the body."""
-DEEP = 0.0015
+DEEP = 0.002
 """Depth in the body [m] from which an outfit takes one."""
 SMOOTH, AFFINE = 0.2, 1.0e6
 """Reaches [m] of the motions that carry an outfit: the usual one, and one by which nothing can begin to cross."""
