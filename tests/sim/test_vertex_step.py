@@ -234,5 +234,5 @@ def test_senseless_materials_and_wind(options, message):
 def test_a_network_that_does_not_read_them(name):
     """Wind would be given and silently have no effect."""
     given = {"materials": Material(), "wind": [1.0, 0.0, 0.0]}[name]
-    with pytest.raises(ValueError, match=f"{name} given, but a Drift reads none"):
+    with pytest.raises(ValueError, match=f"{name} given, but this Drift reads none"):
         Simulator(drift(), "cpu").rollout(skirt(), walk(2), **{name: given})

@@ -79,7 +79,7 @@ def test_materials_of_outfits():
     outfits = [Outfit(layered()), Outfit([skirt()], cotton)]
     assert unfolded(outfits, walk(2), None, None).materials == [None, None, cotton]
     assert unfolded([Outfit(layered()), Outfit([skirt()])], walk(2), None, denim).materials == denim
-    with pytest.raises(ValueError, match="materials given, but a ManifoldAwareTransformer reads none"):
+    with pytest.raises(ValueError, match="materials given, but this ManifoldAwareTransformer reads none"):
         simulator(network()).rollout(Outfit(layered(), denim), walk(2))
 
 
