@@ -6,6 +6,9 @@ stands still, as in a cold start. Each sample has a random number from 0 to 1, b
 from which predictions replace the truth, and a displacement of its history (noise.py). Garments are bound to their
 bodies (kernels/features/skin.py) where a simulation would be: mostly in the first frame of the sequence, otherwise in
 any frame before t-K of the last `RECENT` ones, as if the simulation had started there.
+
+Some histories lie between the recorded one and the smooth skin, at rest relative to it or already on their way back;
+their targets come back by `RETURN` in a frame. A target that came back at once would teach velocities that overshoot.
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ from .interactions import UnusableSequence
 from .noise import NoiseBasis, NoiseConfig
 
 RECENT = 40  # frames
+RETURN = 0.2  # share of a displacement towards skin by which targets come back in a frame
 FROM_FIRST = 0.7  # share of samples that are bound in the first frame
 
 
@@ -105,6 +109,7 @@ class OutfitBatch:
     wind: torch.Tensor  # [N,B,3] velocity of the air [m/s]
     materials: torch.Tensor  # [B,M]; NaN for a garment without one
     delta: torch.Tensor  # [3,V,3] displacement of the three frames of a history, newest first
+    away: torch.Tensor  # [V,3] the part of delta[0] towards smooth skin, from which targets return little by little
     draw: torch.Tensor  # [number of samples], from 0 to 1
     sample_of_garment: torch.Tensor  # int64 [B]
     sample_of_vertex: torch.Tensor  # int64 [V]
@@ -119,6 +124,15 @@ class OutfitBatch:
     def recorded(self, frame: int) -> list[torch.Tensor]:
         """Recorded and displaced positions [V,3] of a frame of the batch and of the two before it."""
         return [self.frames[frame - k] + self.delta[k] for k in range(3)]
+
+    def wanted(self, frame: int, predicted: torch.Tensor) -> torch.Tensor:
+        """Targets of a frame of the batch, [V,3].
+
+        Args:
+            frame: Number of the frame.
+            predicted: Number of steps that have been predicted up to this frame, for each vertex, [V].
+        """
+        return self.frames[frame] + ((1.0 - RETURN) ** predicted)[:, None] * self.away
 
     def inputs(self, recent: list[torch.Tensor], frame: int, reads: frozenset[str]) -> FrameInputs:
         """What a network gets of a frame; the features of faces are empty.
@@ -211,7 +225,8 @@ class OutfitBuilder:
             wind.append(np.repeat(data.wind[frames][:, None], len(data.garments), axis=1))
             deltas.append(np.zeros((history, *past[-1].shape[1:]), np.float32) if delta is None else delta[::-1])
             draws.append(stream.random())
-            towards.append(stream.random() if self.to_skin and stream.random() < self.to_skin else 0.0)
+            chosen = self.to_skin > 0.0 and stream.random() < self.to_skin
+            towards.append((stream.random() * chosen, float(stream.random() < 0.5)) if chosen else (0.0, 0.0))
             start = max(t - self.ahead - 2, 0)
             early = stream.random() < FROM_FIRST
             frame = 0 if early else int(stream.integers(max(start - RECENT, 0), start + 1))
@@ -236,11 +251,13 @@ class OutfitBuilder:
             self.device,
         )
         moved = send(np.concatenate(deltas, axis=1))
-        if any(towards):
-            newest, share = self.ahead + 2, send(np.array(towards, np.float32))[sample_of_vertex][:, None]
-            moved = moved + torch.stack(
-                [share * (skin(body[k])[1] - recorded[k]) for k in range(newest, newest - 3, -1)]
-            )
+        away = torch.zeros_like(recorded[0])
+        if any(share for share, _ in towards):
+            share, speed = (send(np.array(part, np.float32))[sample_of_vertex] for part in zip(*towards, strict=True))
+            known = range(self.ahead + 2, self.ahead - 1, -1)  # newest first
+            to_skin = torch.stack([skin(body[k])[1] - recorded[k] for k in known])
+            parts = torch.stack([share * (1.0 - RETURN) ** (-k * speed) for k in range(history)])
+            moved, away = moved + parts[..., None] * to_skin, share[:, None] * to_skin[0]
         return OutfitBatch(
             packed=packed,
             bodies=packed_bodies,
@@ -251,6 +268,7 @@ class OutfitBuilder:
             wind=send(np.concatenate(wind, axis=1).astype(np.float32)),
             materials=send(np.concatenate([data.materials for data in mine])),
             delta=moved,
+            away=away,
             draw=send(np.array(draws, np.float32)),
             sample_of_garment=sample_of_garment,
             sample_of_vertex=sample_of_vertex,

@@ -55,8 +55,8 @@ class PositionConfig:
         noise: Factor of the displacements of histories (`noise`); the publication has none, and a network cannot know
             by how much a whole garment was displaced.
         to_skin: Share of samples whose history is drawn by a random part of the way to where the garment would be as
-            smooth skin of its body (kernels/features/skin.py), with the recorded frame as target. Rollouts that have
-            lost their way look like that, and one step teaches the way back. The publication has none.
+            smooth skin of its body (kernels/features/skin.py); targets come back from there frame by frame. Rollouts
+            that have lost their way look like that, and one step teaches the way back. The publication has none.
         rollout: Number of steps without gradient before those with a loss, at the end of the run. It grows evenly.
     """
 
@@ -114,12 +114,14 @@ class PositionObjective(nn.Module):
 
     def forward(self, batch: OutfitBatch) -> torch.Tensor:
         """The numbers named in `figures`, float32 [7], as means over the steps with a loss."""
-        newest = batch.ahead + 2
-        recent = self._rolled_out(batch, self.ahead(batch))
+        newest, ahead = batch.ahead + 2, self.ahead(batch)
+        starts = (batch.draw * (ahead + 1)).long().clamp(max=ahead)[batch.sample_of_vertex]
+        recent = self._rolled_out(batch, ahead, starts)
         found = []
         for k in range(batch.steps):
             step = self._step(batch, recent, newest + k)
-            found.append(self._losses(batch, step, newest + k + 1))
+            wanted = batch.wanted(newest + k + 1, ahead - starts + k + 1)
+            found.append(self._losses(batch, step, newest + k + 1, wanted))
             recent = [step.positions, *recent[:2]]
         terms = torch.stack(found).mean(dim=0)
         weights = [getattr(self.config, name[5:]) for name in self.figures[1:6]]
@@ -129,9 +131,9 @@ class PositionObjective(nn.Module):
             total = total + self.config.rotation * self.network.rotation_penalty()
         return torch.cat([total[None], terms])
 
-    def _rolled_out(self, batch: OutfitBatch, steps: int) -> list[torch.Tensor]:
-        """Positions at t, t-1 and t-2 [V,3] after a rollout of some steps without gradient."""
-        starts = (batch.draw * (steps + 1)).long().clamp(max=steps)[batch.sample_of_vertex]
+    def _rolled_out(self, batch: OutfitBatch, steps: int, starts: torch.Tensor) -> list[torch.Tensor]:
+        """Positions at t, t-1 and t-2 [V,3] after a rollout of some steps without gradient, of which each vertex takes
+        those from its number in `starts` [V]."""
         recent = batch.recorded(batch.ahead + 2 - steps)
         if not steps:
             return recent
@@ -153,9 +155,9 @@ class PositionObjective(nn.Module):
         pins = batch.packed.pins.long()
         return step._replace(positions=step.positions.index_copy(0, pins, batch.frames[frame + 1][pins]))
 
-    def _losses(self, batch: OutfitBatch, step: VertexStep, frame: int) -> torch.Tensor:
-        """Terms of the loss without their weights [5], and the mean distance [m]."""
-        wanted, found, faces = batch.frames[frame], step.positions, batch.packed.faces
+    def _losses(self, batch: OutfitBatch, step: VertexStep, frame: int, wanted: torch.Tensor) -> torch.Tensor:
+        """Terms of the loss without their weights [5], and the mean distance [m], from targets [V,3]."""
+        found, faces = step.positions, batch.packed.faces
         difference = found - wanted
         position = (SCALE * difference).square().sum(dim=1).mean()
         patch = position.new_zeros(())
