@@ -7,8 +7,8 @@ from which predictions replace the truth, and a displacement of its history (noi
 bodies (kernels/features/skin.py) where a simulation would be: mostly in the first frame of the sequence, otherwise in
 any frame before t-K of the last `RECENT` ones, as if the simulation had started there.
 
-Some histories lie between the recorded one and the smooth skin, at rest relative to it or already on their way back;
-their targets come back by `RETURN` in a frame. A target that came back at once would teach velocities that overshoot.
+Some histories lie between the recorded one and the smooth skin, at rest relative to it or already on their way back.
+Targets of displaced histories come back by `RETURN` in a frame; at once, they would teach velocities that overshoot.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from .interactions import UnusableSequence
 from .noise import NoiseBasis, NoiseConfig
 
 RECENT = 40  # frames
-RETURN = 0.2  # share of a displacement towards skin by which targets come back in a frame
+RETURN = 0.2  # share of a displacement by which targets come back in a frame
 FROM_FIRST = 0.7  # share of samples that are bound in the first frame
 
 
@@ -109,7 +109,6 @@ class OutfitBatch:
     wind: torch.Tensor  # [N,B,3] velocity of the air [m/s]
     materials: torch.Tensor  # [B,M]; NaN for a garment without one
     delta: torch.Tensor  # [3,V,3] displacement of the three frames of a history, newest first
-    away: torch.Tensor  # [V,3] the part of delta[0] towards smooth skin, from which targets return little by little
     draw: torch.Tensor  # [number of samples], from 0 to 1
     sample_of_garment: torch.Tensor  # int64 [B]
     sample_of_vertex: torch.Tensor  # int64 [V]
@@ -132,7 +131,7 @@ class OutfitBatch:
             frame: Number of the frame.
             predicted: Number of steps that have been predicted up to this frame, for each vertex, [V].
         """
-        return self.frames[frame] + ((1.0 - RETURN) ** predicted)[:, None] * self.away
+        return self.frames[frame] + ((1.0 - RETURN) ** predicted)[:, None] * self.delta[0]
 
     def inputs(self, recent: list[torch.Tensor], frame: int, reads: frozenset[str]) -> FrameInputs:
         """What a network gets of a frame; the features of faces are empty.
@@ -251,13 +250,12 @@ class OutfitBuilder:
             self.device,
         )
         moved = send(np.concatenate(deltas, axis=1))
-        away = torch.zeros_like(recorded[0])
         if any(share for share, _ in towards):
             share, speed = (send(np.array(part, np.float32))[sample_of_vertex] for part in zip(*towards, strict=True))
             known = range(self.ahead + 2, self.ahead - 1, -1)  # newest first
             to_skin = torch.stack([skin(body[k])[1] - recorded[k] for k in known])
             parts = torch.stack([share * (1.0 - RETURN) ** (-k * speed) for k in range(history)])
-            moved, away = moved + parts[..., None] * to_skin, share[:, None] * to_skin[0]
+            moved = moved + parts[..., None] * to_skin
         return OutfitBatch(
             packed=packed,
             bodies=packed_bodies,
@@ -268,7 +266,6 @@ class OutfitBuilder:
             wind=send(np.concatenate(wind, axis=1).astype(np.float32)),
             materials=send(np.concatenate([data.materials for data in mine])),
             delta=moved,
-            away=away,
             draw=send(np.array(draws, np.float32)),
             sample_of_garment=sample_of_garment,
             sample_of_vertex=sample_of_vertex,

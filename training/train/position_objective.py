@@ -52,8 +52,8 @@ class PositionConfig:
         threshold: Least distance from the body or the garment beneath [m].
         reach: Distance up to which a garment has to do with the one beneath it [m].
         collisions_from: Share of the run after which collisions count, from 0 to 1.
-        noise: Factor of the displacements of histories (`noise`); the publication has none, and a network cannot know
-            by how much a whole garment was displaced.
+        noise: Factor of the displacements of histories (`noise`), from which targets come back frame by frame; the
+            publication has none.
         to_skin: Share of samples whose history is drawn by a random part of the way to where the garment would be as
             smooth skin of its body (kernels/features/skin.py); targets come back from there frame by frame. Rollouts
             that have lost their way look like that, and one step teaches the way back. The publication has none.
