@@ -75,7 +75,7 @@ def test_demo_writes_what_it_prints(tmp_path, capsys, bundle) -> None:
     first, second = printed.split("faces ")[1:]
     rows = {line.split("  ")[0].strip(): line.split()[-2:] for line in first.splitlines()}
     layers = [motions.pop(f"outfit {name}") for name in ("dress", "jacket")]
-    assert "outfit of dress under jacket, network 'default', which does not read materials and wind" in printed
+    assert "outfit of dress under jacket, network 'layers'\n" in printed
     below = {line.split("  ")[0].strip(): line.split()[-2:] for line in second.splitlines()}
     for row, of in (
         ("crossing pairs with other garments, most", "layer"),
@@ -150,6 +150,10 @@ def test_the_outfit_moves_in_its_wind(tmp_path, capsys, bundle, monkeypatch) -> 
         expected = simulator.rollout(item.outfit, bundle.collider, **options)
         for motion in expected:
             assert np.array_equal(found[f"outfit {motion.name}"].vertices, motion.vertices) == same
+    (tmp_path / "layers.safetensors").unlink()
+    demo.run(tmp_path / "without", device="cpu", frames=2, moments=2, film=False)
+    told = "outfit of dress under jacket, network 'default', which does not read materials and wind"
+    assert told in capsys.readouterr().out
 
 
 def test_other_assets_are_checked(tmp_path, bundle) -> None:
