@@ -76,7 +76,8 @@ class Material:
         - density as measured;
         - stretch = shear with stretch + 2 shear equal to the stiffness that was measured at 17 % extension, the mean of
           both threads and all five directions. Cloth that is stretched less is softer, its two threads differ up to
-          fivefold, and it shears more easily than an isotropic sheet;
+          fivefold, and it shears more easily than an isotropic sheet. The numbers are taken as N/m as they stand;
+          ARCSim doubles them when it reads its files, so they may be low by a factor of two;
         - bend from the stiffness of the plate [N m] at the smallest curvature, the mean of the directions: on a mesh
           with edges of 34 mm, divided by √3/2 of those.
 
