@@ -124,7 +124,10 @@ def make(options: Table) -> dict[str, Any]:
         DataLacks: There is no sequence to measure.
     """
     name = type(options).__name__.lower()
-    networks = dict(_named(text) for text in options.network)
+    named = [_named(text) for text in options.network]
+    networks = dict(named)
+    if len(networks) < len(named):
+        raise OptionMissing(f"--network: a name is given twice in {' '.join(options.network)}")
     rows = rows_of(networks, contact=options.contact, apart=options.apart, static=options.static, device=options.device)
     skipped: dict[str, str] = {}
     folders = [f for split in dict.fromkeys(options.splits) for f in folders_of(Path(options.data), split, skipped)]

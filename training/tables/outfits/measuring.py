@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -113,7 +112,7 @@ def measure_row(row: Row, cases: list[Case], starts: list[Start], frames: int | 
         For each sequence and start that fit: `Case.facts`, `rollout_figures`, `seconds` of the rollout, and `reason`
         where it ended with an error. A rollout that ends with an error is not finite.
     """
-    file = folder / f"{re.sub(r'[^a-z0-9]+', '_', row.name.lower()).strip('_')}.json"
+    file = folder / f"{row.stem}.json"
     identity = {"row": row.name, "kind": row.kind, "contact": row.contact, "apart": row.apart}
     identity |= {"network": row.checksum, "device": row.device, "code": code_checksum()}
     known = _known(file, identity)

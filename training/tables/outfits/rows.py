@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -43,7 +44,7 @@ WHOLE = Start("whole", 0, None, True)
 
 
 class Missing(ValueError):
-    """A named network was not given."""
+    """A named network was not given, or two cannot be told apart."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,11 @@ class Row:
     contact: bool = False
     apart: bool = False
     device: str | None = None
+
+    @property
+    def stem(self) -> str:
+        """Name of its file, without suffix: letters and digits of its name."""
+        return re.sub(r"[^a-z0-9]+", "_", self.name.lower()).strip("_")
 
     @cached_property
     def checksum(self) -> str | None:
@@ -127,7 +133,7 @@ def rows_of(
         device: Device of the networks.
 
     Raises:
-        Missing: A name in `apart` is no network.
+        Missing: A name in `apart` is no network, or two rows would have one file.
         CheckpointError: There is no such network.
     """
     unknown = [name for name in apart if name not in networks]
@@ -143,4 +149,12 @@ def rows_of(
             rows.append(replace(row, name=name + APART, apart=True))
     if static is not None:
         rows.append(Row("static (DeePSD-like)", "static", Path(static)))
-    return [*rows, Row("skinned", "skinned"), Row("rigid", "rigid")]
+    rows += [Row("skinned", "skinned"), Row("rigid", "rigid")]
+    first: dict[str, str] = {}
+    for row in rows:
+        if first.setdefault(row.stem, row.name) != row.name:
+            raise Missing(
+                f"the rows {first[row.stem]!r} and {row.name!r} would share the file {row.stem}.json; the letters and "
+                "digits of names must differ"
+            )
+    return rows

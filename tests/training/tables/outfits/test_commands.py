@@ -137,6 +137,10 @@ def test_what_is_lacking_is_said(data, tmp_path):
     """A misspelt network or an empty split would give an empty table."""
     with pytest.raises(OptionMissing, match="NAME=CHECKPOINT"):
         make(Table4(data, tmp_path, ("fast",)))
+    with pytest.raises(OptionMissing, match="a name is given twice"):
+        make(Table4(data, tmp_path, ("a=fast", "a=small")))
+    with pytest.raises(Missing, match=r"'Net' and 'Net\+' would share the file net.json"):
+        make(Table4(data, tmp_path, ("Net=fast", "Net+=small")))
     with pytest.raises(Missing, match="there is no --network other=CHECKPOINT"):
         make(Table4(data, tmp_path, ("fast=fast",), apart=("other",)))
     with pytest.raises(DataLacks, match="no sequence of train to measure"):
