@@ -48,24 +48,38 @@ class Skin:
     weight: torch.Tensor
 
     @torch.no_grad()
-    def __call__(self, body: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where a pose of the bodies takes the garments.
+    def pose(self, body: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """How the points of the bodies have moved since the bound pose.
 
         Args:
-            body: Bodies [m], shape [U,3].
+            body: Bodies [m], in one pose or several, shape [...,U,3].
 
         Returns:
-            Rotations R, [V,3,3], and positions s [m], [V,3]; without gradients.
+            Rotations R_j, [...,N,3,3], and means c_j [m], [...,N,3].
         """
-        here = body[self.around]
-        middle = here.mean(dim=1)
-        covariance = (here - middle[:, None]).mT @ self.shape.to(body.dtype)
-        turn = rotation(covariance.float() * SCALE).to(body.dtype)
-        weight = self.weight.to(body.dtype)
-        turns = turn[self.points]
-        places = middle[self.points] + (turns @ self.offset.to(body.dtype)[..., None])[..., 0]
-        blended = (weight[..., None, None] * turns).sum(dim=1)
-        return rotation(blended.float()).to(body.dtype), (weight[..., None] * places).sum(dim=1)
+        here = body[..., self.around, :]
+        middle = here.mean(dim=-2)
+        covariance = (here - middle[..., None, :]).mT @ self.shape.to(body.dtype)
+        turn = rotation((covariance.float() * SCALE).reshape(-1, 3, 3)).to(body.dtype)
+        return turn.view(covariance.shape), middle
+
+    @torch.no_grad()
+    def __call__(self, body: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where poses of the bodies take the garments.
+
+        Args:
+            body: Bodies [m], in one pose or several, shape [...,U,3].
+
+        Returns:
+            Rotations R, [...,V,3,3], and positions s [m], [...,V,3]; without gradients.
+        """
+        turn, middle = self.pose(body)
+        weight, offset = self.weight.to(body.dtype), self.offset.to(body.dtype)
+        turns = turn[..., self.points, :, :]
+        places = middle[..., self.points, :] + (turns @ offset[..., None])[..., 0]
+        blended = (weight[..., None, None] * turns).sum(dim=-3)
+        frame = rotation(blended.float().reshape(-1, 3, 3)).to(body.dtype).view(blended.shape)
+        return frame, (weight[..., None] * places).sum(dim=-2)
 
 
 SCALE = 1e3  # brings covariances, near 1e-3 m^2, to the size of deformation gradients

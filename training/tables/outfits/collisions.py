@@ -106,6 +106,7 @@ def beneath(points: np.ndarray, vertices: np.ndarray, surface: Surface, deepest:
     zero = share < EDGE
     normal = normals[face].copy()
     at_border = np.zeros(len(points), bool)
+    at_vertices = angle_weighted(vertices, faces, normals)
     for k in range(3):
         edge = zero[:, k] & (zero.sum(axis=1) == 1)
         other = surface.across[face[edge], k]
@@ -113,7 +114,7 @@ def beneath(points: np.ndarray, vertices: np.ndarray, surface: Surface, deepest:
         at_border[edge] = other < 0
         corner = zero[:, k - 1] & zero[:, k - 2]
         vertex = faces[face[corner], k]
-        normal[corner] = angle_weighted(vertices, faces, normals)[vertex] if corner.any() else 0.0
+        normal[corner] = at_vertices[vertex]
         at_border[corner] = surface.border[vertex]
     side = np.einsum("ni,ni->n", normal, points - nearest)
     return (side < 0.0) & ~at_border & (np.asarray(squared).reshape(-1) <= deepest**2)

@@ -39,7 +39,7 @@ from torch import nn
 from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.kernels.deformation.svd import rotation
-from warpgarment.kernels.features.skin import BOUND, SCALE, Skin, bind
+from warpgarment.kernels.features.skin import BOUND, Skin, bind
 from warpgarment.objects.body import BodyMotion
 from warpgarment.training.data.sequence import Sequence
 
@@ -92,10 +92,7 @@ class Bound:
 
     def pose(self, body: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         """Rotations R_j [T,N,3,3] and means c_j [T,N,3] of the points in frames of the body [m], [T,U,3]."""
-        here = torch.from_numpy(np.ascontiguousarray(body, np.float32))[:, self.skin.around]
-        middles = here.mean(dim=2)
-        covariance = (here - middles[:, :, None]).mT @ self.skin.shape
-        return rotation((covariance * SCALE).flatten(0, 1)).unflatten(0, middles.shape[:2]), middles
+        return self.skin.pose(torch.from_numpy(np.ascontiguousarray(body, np.float32)))
 
     def of_points(self, turns: torch.Tensor, middles: torch.Tensor) -> torch.Tensor:
         """What φ reads of each point in each frame, [T,N,OF_POINT]."""
