@@ -104,7 +104,7 @@ def predict(
     *,
     cold: bool = False,
     body: BodyMotion | None = None,
-    layers: bool | None = None,
+    layers: bool = False,
     apart: bool = False,
 ) -> np.ndarray:
     """Rolls a sequence out from its recorded frames.
@@ -116,8 +116,8 @@ def predict(
         steps: Number of frames to predict; frame `newest + steps` of the body must exist.
         cold: Whether that frame is the only recorded frame that is an input.
         body: The body of the sequence, `sequence.body()`, if the caller has it already.
-        layers: Whether garments are kept from crossing each other and themselves. None: no, and a network that reads
-            neither materials nor wind gets all garments as one mesh; otherwise each garment is an entry of its own.
+        layers: Whether garments are kept from crossing each other and themselves. Each garment of several is an entry
+            of its own in any case.
         apart: Whether each garment is alone on a body of its own, so that a network for outfits sees no other garment.
 
     Returns:
@@ -143,8 +143,8 @@ def predict(
     with warnings.catch_warnings():  # a rollout that fails is visible in the figures
         warnings.simplefilter("ignore", RuntimeWarning)
         worn = getattr(sequence, "layers", ())
-        if layers is not None or apart or len(worn) > 1 or (worn and reads):  # each garment by itself
-            moved = _outfit(simulator, cast(RecordedOutfit, sequence), part, first, start, known, bool(layers), apart)
+        if layers or len(worn) > 1 or (worn and reads):  # each garment by itself
+            moved = _outfit(simulator, cast(RecordedOutfit, sequence), part, first, start, known, layers, apart)
         else:
             moved = simulator.rollout(sequence.garment, part, first_vertices=start, history=known).vertices
     predicted = np.full((steps, *sequence.vertices.shape[1:]), np.nan, np.float32)

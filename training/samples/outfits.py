@@ -105,7 +105,7 @@ class OutfitBatch:
     layout: Any  # of the network
     frames: torch.Tensor  # [N,V,3] recorded positions of garments
     body: torch.Tensor  # [N,U,3] bodies
-    skin: Skin  # the garments as bound to their bodies in some earlier frame
+    skin: Skin | None  # the garments as bound to their bodies in some earlier frame; None if nobody reads it
     wind: torch.Tensor  # [N,B,3] velocity of the air [m/s]
     materials: torch.Tensor  # [B,M]; NaN for a garment without one
     delta: torch.Tensor  # [3,V,3] displacement of the three frames of a history, newest first
@@ -242,15 +242,13 @@ class OutfitBuilder:
         sample_of_garment = send(sample)
         sample_of_vertex = sample_of_garment[packed.garment_of_vertex.long()]
         recorded, body = torch.cat(past, dim=1), send(np.concatenate(bodies, axis=1))
-        skin = bind(
-            np.concatenate([cloth for cloth, _ in bound]),
-            np.repeat(np.arange(len(mine)), [len(cloth) for cloth, _ in bound]),
-            np.concatenate([lower for _, lower in bound]),
-            packed_bodies.vertex_offsets,
-            self.device,
-        )
+        skin = None
+        if self.to_skin or "skin" in self.network.reads:
+            owner = np.repeat(np.arange(len(mine)), [len(cloth) for cloth, _ in bound])
+            cloth, lower = (np.concatenate(part) for part in zip(*bound, strict=True))
+            skin = bind(cloth, owner, lower, packed_bodies.vertex_offsets, self.device)
         moved = send(np.concatenate(deltas, axis=1))
-        if any(share for share, _ in towards):
+        if skin is not None and any(share for share, _ in towards):
             share, speed = (send(np.array(part, np.float32))[sample_of_vertex] for part in zip(*towards, strict=True))
             known = range(self.ahead + 2, self.ahead - 1, -1)  # newest first
             to_skin = torch.stack([skin(body[k])[1] - recorded[k] for k in known])
