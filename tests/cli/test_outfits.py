@@ -126,6 +126,7 @@ def test_what_a_network_does_not_read_is_refused(scene, tmp_path, capsys):
     said = refused(capsys, scene, "--wind", 1, 0, 0, *out)
     assert "--wind: the network" in said
     assert "reads no wind" in said
+    assert "--weights, such as layers" in said
     assert "--material: the network" in refused(capsys, scene, "--material", "cotton", *out)
     assert not list(tmp_path.iterdir())
 

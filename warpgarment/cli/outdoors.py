@@ -187,10 +187,14 @@ def check_read(reads: Collection[str], weights: str, given: dict[str, bool]) -> 
     Raises:
         UsageError: One was that is not read.
     """
+    from warpgarment.nn import checkpoint
+
     for name, is_given in given.items():
         if is_given and name not in reads:
             option = "--wind" if name == "wind" else "--material"
+            ships = [known for known, inputs in checkpoint.shipped_reads().items() if name in inputs]
+            such = f", such as {ships[0]}" if ships else ""
             raise UsageError(
                 f"{option}: the network {weights!r} reads no {name}, so it would change nothing. Leave it out, or give "
-                "one that reads it with --weights."
+                f"one that reads it with --weights{such}."
             )
