@@ -96,7 +96,7 @@ class LayersNet(GarmentNetwork):
         self.decoder = nn.Sequential(
             nn.Linear(state + 2 * width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3)
         )
-        if config.residual:  # untrained, cloth moves on as it moved
+        if config.residual:  # untrained, cloth goes to its base
             last = cast(nn.Linear, self.decoder[-1])
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
