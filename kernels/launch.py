@@ -54,6 +54,8 @@ def expect(
 def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A Warp array over the tensor's memory, without a gradient buffer; copies only a tensor that is not contiguous."""
     wp.init()
+    if tensor.numel() == 0:
+        tensor = tensor.new_empty(tensor.shape)  # empty slices have strides that Warp refuses
     return cast(wp.array, wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False))
 
 
@@ -64,7 +66,7 @@ def as_argument(tensor: torch.Tensor, dtype: type) -> object:
     copied into a Warp array, which keeps the copy alive.
     """
     if tensor.numel() == 0:
-        tensor = tensor.new_empty(tensor.shape)  # empty slices have strides that Warp refuses
+        tensor = tensor.new_empty(tensor.shape)  # see as_warp
     elif not tensor.is_contiguous():
         return as_warp(tensor, dtype)
     return descriptor(tensor, dtype)

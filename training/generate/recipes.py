@@ -80,7 +80,7 @@ class GenerateConfig:
     motions: Path | None = None
     procedural_share: float = 0.25
     bodies: Literal["anny", "bundled"] = "anny"
-    teacher: Literal["newton", "blender"] = "newton"
+    teacher: Literal["newton", "blender", "warp"] = "newton"
     materials: Literal["fixed", "sampled"] | None = None
     wind: bool | None = None
     seed: int = 0

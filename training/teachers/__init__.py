@@ -5,7 +5,7 @@
         ...
 
 `newton` (Newton's VBD, extra `physics`) runs in this process; `blender` runs Blender's cloth through `bpy` in a virtual
-environment of its own, as a subprocess. `TEACHERS` names the module of each, which is imported when it is used.
+environment of its own, as a subprocess; `warp` is this project's own solver (`warpgarment.kernels.physics`). `TEACHERS` names the module of each, which is imported when it is used.
 """
 
 from __future__ import annotations
@@ -43,6 +43,9 @@ TEACHERS: dict[str, TeacherEntry] = {
         "warpgarment.training.teachers.newton.teacher", "physics", ("newton", "warp-lang"), "Newton (Apache-2.0)"
     ),
     "blender": TeacherEntry("warpgarment.training.teachers.blender.teacher", None, (), "Blender (GPL; not its output)"),
+    "warp": TeacherEntry(
+        "warpgarment.training.teachers.warp.teacher", None, ("warp-lang",), "warpgarment (Apache-2.0)"
+    ),
 }
 
 
