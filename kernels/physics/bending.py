@@ -13,7 +13,7 @@ The second term is viscosity within one implicit step. The gradient of the angle
 | x_0, x_1; x_2, x_3 | `hinges` | ends of the edge; corners opposite to it in the faces A and B |
 | e, ê | `edge`, `along` | x_1 - x_0 and its direction |
 | n_A, n_B | `normal_a`, `normal_b` | e × (x_2 - x_0) and (x_3 - x_0) × e: normals with the length of twice the area |
-| θ, θ⁰, θ⁻ | `angle`, `rest_angle`, `angle_before` | angle between the normals: now, at rest, at the start of the step |
+| θ, θ⁰, θ⁻ | `angle`, `rest_angle`, `angle_before` | angle between normals: now, at rest, at the start of the step |
 | k_b l | `stiffness` | bending stiffness [N] times rest length of the edge [m] |
 | c_b l / h | `damping` | damping of the angle over the length of the step [N m] |
 

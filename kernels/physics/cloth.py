@@ -1,4 +1,4 @@
-"""The constant part of the physics of a packed batch: masses, rest shapes and stiffnesses, and who gathers from whom."""
+"""The constant part of the physics of a packed batch: masses, rest shapes and stiffness, and who gathers from whom."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse
 import torch
-
 
 SHARE = 0.5
 """Share of the stiffness at rest in the constant matrix, with which fewest iterations are needed."""
@@ -106,7 +105,7 @@ class PhysicsCloth(NamedTuple):
         group = np.searchsorted(vertex_start, faces, side="right") - 1
         if (group != group[:, :1]).any() or (np.diff(group[:, 0]) < 0).any():
             raise ValueError("faces must lie in one group each, and in the order of the groups")
-        inverse, area, frame = _rest_triangles(points, faces, axes)
+        inverse, area = _rest_triangles(points, faces, axes)
         stiffness = np.stack([sheet.stiffness for sheet in sheets])[sheet_of_face] * area[:, None, None]
         density, damping, bend, bend_damping = (
             np.array([getattr(sheet, name) for sheet in sheets], np.float64)[sheet_of_face]
@@ -172,10 +171,8 @@ def angles(points: np.ndarray, hinges: np.ndarray) -> np.ndarray:
     return np.arctan2((np.cross(a, b) * along).sum(1), (a * b).sum(1))
 
 
-def _rest_triangles(
-    points: np.ndarray, faces: np.ndarray, axes: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """D⁻¹ [F,2,2], areas [F], and the two axes of each face in space, [F,2,3]."""
+def _rest_triangles(points: np.ndarray, faces: np.ndarray, axes: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """D⁻¹ [F,2,2] and areas [F]."""
     a, b = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
     normal = np.cross(a, b)
     double = np.linalg.norm(normal, axis=1)
@@ -193,7 +190,7 @@ def _rest_triangles(
     second = np.cross(normal, first)
     frame = np.stack([first, second], 1)
     rest = np.einsum("fai,fib->fab", frame, np.stack([a, b], 2))
-    return np.linalg.inv(rest), 0.5 * double, frame
+    return np.linalg.inv(rest), 0.5 * double
 
 
 def _rest_stiffness(

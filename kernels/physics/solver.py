@@ -27,7 +27,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels.cloth.contacts import Contacts
-from warpgarment.kernels.launch import as_warp, expect, torch_stream
+from warpgarment.kernels.launch import as_warp, torch_stream
 from warpgarment.kernels.linear import triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System, block_dim
@@ -93,6 +93,7 @@ class ImplicitSolver:
         held = np.zeros(count, bool) if held is None else np.asarray(held, bool)
         self.cloth, self.iterations, self._device = cloth, int(iterations), device
         self._groups = len(cloth.vertex_start) - 1
+        self._early = tolerance > 0.0 and device.type == "cpu"  # a GPU does all iterations: the host would wait for it
         matrix = cloth.matrix + scipy.sparse.diags(inertia * np.maximum(cloth.mass.cpu().numpy(), 1e-12))
         free = scipy.sparse.diags((~held).astype(np.float64))
         matrix = (free @ matrix @ free + scipy.sparse.diags(held * matrix.diagonal().max(initial=1e-12))).tocsr()
@@ -202,9 +203,7 @@ class ImplicitSolver:
             "vertices": record(
                 vertex_kernel, len(cloth.mass), [*model, trial, *planes, corner, more], [energies[2], gradient]
             ),
-            "accept": record_blocks(
-                accept_kernel, [*starts, memory, self._search, *energies, trial, gradient], [load]
-            ),
+            "accept": record_blocks(accept_kernel, [*starts, memory, self._search, *energies, trial, gradient], [load]),
             "direct": record_blocks(
                 direct_kernel, [starts[0], memory, float(tolerance), self._search, solved], [trial]
             ),
@@ -232,6 +231,7 @@ class ImplicitSolver:
         wanted = ["membrane", "pairs", "bending", "vertices", "accept"]
         evaluated = [name for name in wanted if name in commands]
         with torch_stream(self._device):
+            self.search["point"].copy_(self.positions)
             commands["begin"].launch()
             for number in range(self.iterations):
                 for name in evaluated:
@@ -240,6 +240,8 @@ class ImplicitSolver:
                     break
                 self._solve()
                 commands["direct"].launch()
+                if self._early and self.search["done"].all():
+                    break
         self.positions.copy_(self.search["point"])
         return self.positions
 

@@ -5,7 +5,8 @@
         ...
 
 `newton` (Newton's VBD, extra `physics`) runs in this process; `blender` runs Blender's cloth through `bpy` in a virtual
-environment of its own, as a subprocess; `warp` is this project's own solver (`warpgarment.kernels.physics`). `TEACHERS` names the module of each, which is imported when it is used.
+environment of its own, as a subprocess; `warp` is this project's own solver (`warpgarment.kernels.physics`).
+`TEACHERS` names the module of each, which is imported when it is used.
 """
 
 from __future__ import annotations

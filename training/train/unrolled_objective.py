@@ -142,6 +142,7 @@ class UnrolledObjective(nn.Module):
                 vertices, compose(output, newest, residual=config.residual), features, body
             )
             if self.unroll.collision_passes:
+                solved = scene.relax(solved, finite)
                 origin = scene.contact.origin(vertices, features)
                 solved = scene.contact(solved, body, finite, origin, measure=False)[0]
             yield terms, solved, recorded

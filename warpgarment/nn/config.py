@@ -61,6 +61,8 @@ class NetworkConfig:
     face_feed_forward: int = 128
     face_layers: int = 2  # number of face layers after the patches; there is one more before them
     channels: tuple[str, ...] = CHANNELS  # features of a face that the network reads, see kernels/features/channels.py
+    physics: int = 0  # iterations of the cloth's own physics after the Poisson solve: sim/stages/relax.py
+    physics_pull: float = 1.0  # weight of the predicted positions in them
     outdoor: tuple[str, ...] = ()  # channels of material and wind that it reads too: kernels/features/outdoor.py
 
     def __post_init__(self) -> None:
@@ -77,7 +79,9 @@ class NetworkConfig:
             raise ValueError(f"dropout must lie in [0, 1), got {self.dropout}")
         if self.face_layers < 0:
             raise ValueError(f"face_layers must not be negative, got {self.face_layers}")
-        for name in ("geodesic_power", "geodesic_radius", "fps", "patch_spacing"):
+        if self.physics < 0:
+            raise ValueError(f"physics must not be negative, got {self.physics}")
+        for name in ("geodesic_power", "geodesic_radius", "fps", "patch_spacing", "physics_pull"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
         if self.heading not in ("world", "canonical"):
@@ -101,12 +105,14 @@ class NetworkConfig:
         return self.history * self.features + OUTDOOR.only(self.outdoor).width
 
     def as_dict(self) -> dict[str, Any]:
-        """Settings as plain values, for a checkpoint; without `channels` and `outdoor` if these are the defaults."""
+        """Settings as plain values, for a checkpoint; `channels`, `outdoor` and `physics` only if not the defaults."""
         values = dataclasses.asdict(self)
         if self.channels == CHANNELS:
             del values["channels"]
         if not self.outdoor:
             del values["outdoor"]
+        if not self.physics:
+            del values["physics"], values["physics_pull"]
         return values
 
     @classmethod

@@ -18,6 +18,7 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     stacked = now.history.stacked(features)
     step = scene.predict(scene.inputs(now, stacked, next_body))
     solved, finite = scene.reconstruct(before, step, features, next_body)
+    solved = scene.relax(solved, finite)
     origin = scene.contact.origin(before, features)
     meets = scene.meet.on
     pushed, finite, depth, report = scene.contact(solved, next_body, finite & now.finite, origin, measure=not meets)

@@ -75,7 +75,7 @@ def per_garment(value: Any, kind: type, count: int, name: str) -> list:
 
 
 def known_frames(
-    garments: Sequence[Garment], single: bool, first_vertices: Any, history: Any, history_length: int
+    garments: Sequence[Garment], single: bool, first_vertices: Any, history: Any, length: int
 ) -> np.ndarray:
     """The frames with which a simulation begins, packed: the rest positions, `first_vertices`, or a history.
 
@@ -84,7 +84,7 @@ def known_frames(
         single: Whether the caller gave one garment, and so one array instead of a list.
         first_vertices: First frame of each garment [m], shape [V,3]; or None.
         history: First H frames of each garment [m], shape [H,V,3]; or None.
-        history_length: Number of frames H of a history.
+        length: Number of frames H of a history.
 
     Returns:
         Positions [m], float32 [K,V,3] with K = 1 or H.
@@ -98,7 +98,7 @@ def known_frames(
     if first_vertices is None and history is None:
         return np.concatenate([garment.vertices for garment in garments])[None]
     frames: tuple[int, ...]
-    name, given, frames = "history", history, (history_length,)
+    name, given, frames = "history", history, (length,)
     if history is None:
         name, given, frames = "first_vertices", first_vertices, ()
     arrays = [given] if single else list(given)

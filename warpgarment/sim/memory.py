@@ -30,6 +30,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies
 from warpgarment.objects.sizes import Sizes
+from warpgarment.sim.stages import relax
 from warpgarment.sim.stages.correct import Corrector
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
@@ -69,6 +70,7 @@ def predict(
     face_splits: int = 1,
     half: bool = False,
     device: torch.device | str = "cpu",
+    physics: int = 0,
     correctors: Sequence[Corrector] = (),
     layers: Sequence[Sequence[int]] = (),
 ) -> Memory:
@@ -81,6 +83,7 @@ def predict(
         face_splits: Number of subsets of faces, as in `Simulator.rollout`.
         half: Whether the network runs in bfloat16, as in `Simulator`.
         device: Device of the simulation; on a CPU, the distances from which weights are made count too.
+        physics: Iterations of the cloth's own physics in a frame.
         correctors: Correctors of the simulation, each of which predicts its own memory.
         layers: Garments of each outfit, as numbers in the batch.
 
@@ -109,6 +112,7 @@ def predict(
             "factors of the solvers": _factors(unique, cpu),
             "history of features": (1 if cpu else GRAPHED) * 4 * config.history * FEATURES * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
+            "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * bool(physics),
             "pairs of layers": PER_MEETING_FACE * sum(len(garments[i].faces) for outfit in layers for i in outfit),
             "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
             peak: passing[peak],
@@ -138,6 +142,7 @@ def check(
     face_splits: int = 1,
     half: bool = False,
     device: torch.device | str = "cpu",
+    physics: int = 0,
     correctors: Sequence[Corrector] = (),
     layers: Sequence[Sequence[int]] = (),
 ) -> None:
@@ -160,6 +165,7 @@ def check(
             face_splits=splits,
             half=halved,
             device=device,
+            physics=physics,
             correctors=correctors,
             layers=[[i for i in outfit if i < number] for outfit in layers],
         )

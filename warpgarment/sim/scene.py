@@ -1,7 +1,8 @@
 """One batch of garments on bodies: the constants of a simulation, and the stages of a frame (`stages/`).
 
 The stages of Algorithm 1 work on packed arrays: `features`, `predict` (the network), `reconstruct` (singular values and
-Poisson solve), `contact` (collisions) and `correct` (does nothing by default). A scene holds no garment positions; they
+Poisson solve), `relax` (a few iterations of physics, off by default), `contact` (collisions) and `correct` (does
+nothing by default). A scene holds no garment positions; they
 are in `state.SimulationState`.
 """
 
@@ -29,6 +30,7 @@ from warpgarment.sim.stages.correct import Correct, Corrector
 from warpgarment.sim.stages.features import Features
 from warpgarment.sim.stages.meet import Meet
 from warpgarment.sim.stages.reconstruct import Reconstruct
+from warpgarment.sim.stages.relax import Relax
 
 from . import memory
 from .bodies import MovingBodies
@@ -56,6 +58,7 @@ class Scene:
         half: Whether the transformer runs in bfloat16.
         timings: Times of the stages, to which each stage adds its own.
         contact_sources: Objects that find contacts, such as `BodyContacts()`.
+        physics: Iterations of the cloth's own physics in a frame; None: as the network's configuration says.
         correctors: What changes positions after contact.
         brought: What users brought, where it is more than `garments`.
         layers: Garments of each outfit, innermost first, as numbers in the batch; see `arguments.outfits`.
@@ -86,6 +89,7 @@ class Scene:
         half: bool,
         timings: Timings,
         contact_sources: Sequence[ContactSource] = (BodyContacts(),),
+        physics: int | None = None,
         correctors: Sequence[Corrector] = (),
         brought: Brought | None = None,
         layers: Sequence[Sequence[int]] = (),
@@ -105,6 +109,7 @@ class Scene:
             face_splits=face_splits,
             half=half,
             device=device,
+            physics=network.config.physics if physics is None else physics,
             correctors=self.correctors,
             layers=layers,
         )
@@ -134,6 +139,9 @@ class Scene:
             replace=network.config.replace_singular_values,
             timings=timings,
         )
+        config = network.config
+        iterations = config.physics if physics is None else physics
+        self.relax = Relax(packed, iterations, config.physics_pull, config.fps, materials, timings)
         self.contact = Contact(
             packed,
             Surface(garments, packed),

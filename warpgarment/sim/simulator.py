@@ -61,6 +61,8 @@ class Simulator:
         timings: Seconds per stage since the simulator was made, a dict. On CUDA, times are measured only while its
             attribute `synchronise` is set.
         contact_sources: List of contact sources for simulations that are started later, at first `[BodyContacts()]`.
+        physics: Iterations of the cloth's own physics in a frame (`stages/relax.py`), for simulations that are started
+            later; at first those of the network's configuration. 0 leaves them out.
         correctors: List of correctors for simulations that are started later, in their order, at first empty.
     """
 
@@ -84,6 +86,7 @@ class Simulator:
         self.epsilon, self.collision_passes, self.half = epsilon, int(collision_passes), half
         self.timings = Timings(self.device)
         self.contact_sources: list[ContactSource] = [BodyContacts()]
+        self.physics = network.config.physics
         self.correctors: list[Corrector] = []
 
     @classmethod
@@ -219,11 +222,10 @@ class Simulator:
         unique, on = numbered(per_garment(told.body, BodyMotion, len(garments), "bodies"))
         if frames is not None and frames < 1:
             raise UsageError(f"frames must be at least 1, got {frames}")
-        fps = self.network.config.fps
-        rates = rates_of(unique, out_fps, fps)
+        rates = rates_of(unique, out_fps, fps := self.network.config.fps)
         needed = [frames_needed(frames, rate, fps) for rate in rates]
         motions = [b.resampled(fps, count) for b, count in zip(unique, needed, strict=True)]
-        brought = self._brought(garments, single, *told.starts)
+        brought = Brought(garments, known_frames(garments, single, *told.starts, length=self.network.config.history))
         given = len(brought.known)
         shot = bodies_of_shot(unique, rates, frames, garments, on) if any(rate != fps for rate in rates) else None
         lengths = [min(motions[i].frames, needed[i] or 2**62) for i in on]
@@ -315,7 +317,7 @@ class Simulator:
         garments, single = told.garments, told.single
         checked, on = given_bodies(body_vertices, body_faces, len(garments), self.network.config.fps)
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
-        brought = self._brought(garments, single, *told.starts)
+        brought = Brought(garments, known_frames(garments, single, *told.starts, length=self.network.config.history))
         first = packed_on([b.vertices[0] for b in checked], self.device)
         known_materials = as_materials(told.materials, len(garments), self.network, self.device)
         air, worn = as_wind(wind, len(garments), self.network, frame=0), outfits(told.layers, on)
@@ -377,6 +379,7 @@ class Simulator:
             half=self.half,
             timings=self.timings,
             contact_sources=self.contact_sources,
+            physics=self.physics,
             correctors=self.correctors,
             brought=brought,
             layers=layers,
@@ -395,6 +398,3 @@ class Simulator:
         else:
             after = state.graph(now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
-
-    def _brought(self, garments: list[Garment], single: bool, first: Any, history: Any) -> Brought:
-        return Brought(garments, known_frames(garments, single, first, history, self.network.config.history))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from reference import physics as reference
+from reference.physics import energies as reference
 from support import meshes
 from support.poison import poison_outputs
 
@@ -27,9 +27,7 @@ def cloth_of(*parts: tuple[meshes.Mesh, Sheet], axes=None) -> PhysicsCloth:
     """Garments as the groups of one batch."""
     packed, starts = meshes.joined(*(mesh for mesh, _ in parts)), meshes.offsets(*(mesh for mesh, _ in parts))[0]
     owner = np.repeat(np.arange(len(parts)), [len(mesh.faces) for mesh, _ in parts])
-    return PhysicsCloth.build(
-        packed.vertices, packed.faces, starts, [sheet for _, sheet in parts], owner, axes=axes
-    )
+    return PhysicsCloth.build(packed.vertices, packed.faces, starts, [sheet for _, sheet in parts], owner, axes=axes)
 
 
 def energies(vertices: np.ndarray, cloth: PhysicsCloth) -> tuple[np.ndarray, np.ndarray]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from reference import physics as reference
 from reference.finite_differences import numeric_gradient
+from reference.physics import energies as reference
 from support import meshes
 
 from warpgarment.kernels.cloth.contacts import Contacts

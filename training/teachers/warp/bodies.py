@@ -62,9 +62,7 @@ class MovingBodies:
         faces = np.concatenate([found[n][1] + starts[n] for n in with_body]).astype(np.int32)
         face_starts = np.cumsum([0] + [len(found[n][1]) for n in with_body])
         ends = [int(starts[n]) for n in with_body] + [int(starts[-1])]
-        self._meshes = BodyMeshes(
-            self._after, torch.from_numpy(faces).to(device), ends, [int(n) for n in face_starts]
-        )
+        self._meshes = BodyMeshes(self._after, torch.from_numpy(faces).to(device), ends, [int(n) for n in face_starts])
         self._faces = self._meshes.faces.long()
         self._body_of_vertex = torch.from_numpy(body[scene_of_vertex]).to(device)
         self._keep = torch.from_numpy(keep.astype(np.float32)).to(device)
@@ -131,9 +129,7 @@ def _bound_pins(
     scenes: Sequence[ClothScene], found: list[tuple[np.ndarray, np.ndarray]], starts: np.ndarray, device: torch.device
 ) -> tuple[torch.Tensor, ...]:
     """Pinned vertices [P], corners of the body's faces [P,3], barycentric coordinates [P,3] and heights [m], [P]."""
-    parts: list[tuple[np.ndarray, ...]] = [
-        (np.zeros(0, int), np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros(0))
-    ]
+    parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int), np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros(0))]
     first = 0
     for scene, (frames, faces), start in zip(scenes, found, starts[:-1], strict=True):
         for cloth, at in zip(scene.cloths, scene.starts[:-1], strict=True):

@@ -42,8 +42,9 @@ class Meeting:
             return torch.from_numpy(values.astype(np.int32)).to(device)
 
         sizes = [len(c.garment.faces) for _, c in cloths]
-        self._outfit_of_vertex = integers(np.repeat(*zip(*[(n, len(c.garment.vertices)) for n, c in cloths])))
-        outfit = np.repeat([number for number, _ in cloths], sizes)
+        numbers = [number for number, _ in cloths]
+        self._outfit_of_vertex = integers(np.repeat(numbers, [len(c.garment.vertices) for _, c in cloths]))
+        outfit = np.repeat(numbers, sizes)
         outfits = Outfits(faces, integers(np.repeat(np.arange(len(cloths)), sizes)), integers(outfit), integers(ranks))
         pairs = FacePairs(outfits, points.float(), margin=MARGIN)
         self._all = torch.ones(len(cloths), dtype=torch.bool, device=device)

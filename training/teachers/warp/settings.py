@@ -35,7 +35,7 @@ class WarpSettings:
     iterations: int = 15
     tolerance: float = 0.0
     scheme: Literal["euler", "bdf2"] = "euler"
-    memory: int = 12
+    memory: int = 20
     bend_damping: float = 1e-4
     contact_stiffness: float = 1e5
     margin: float = 3e-3

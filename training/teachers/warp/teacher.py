@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -140,7 +141,7 @@ class WarpTeacher:
                 motion.advance(meeting.safe(end) if meeting else end.clone())
             if frame >= settle:
                 shown = motion.points.float().cpu().numpy()
-                yield [shown[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
+                yield [shown[a:b] for a, b in itertools.pairwise(starts)]
 
 
 def pressed(solver: ImplicitSolver, points: torch.Tensor) -> torch.Tensor:
@@ -154,7 +155,8 @@ class _Motion:
 
     def __init__(self, points: torch.Tensor, scheme: str, step: float) -> None:
         self.points, self.velocity, self._step = points, torch.zeros_like(points), step
-        self._second, self._before = scheme == "bdf2", None
+        self._second = scheme == "bdf2"
+        self._before: tuple[torch.Tensor, torch.Tensor] | None = None
 
     def target(self, acceleration: torch.Tensor) -> torch.Tensor:
         h = self._step
@@ -247,10 +249,10 @@ def _cloth(
             faces.append(garment.faces + first)
             owner.append(np.full(len(garment.faces), len(sheets) - 1))
             first = part.stop
-    cloth = PhysicsCloth.build(
+    packed = PhysicsCloth.build(
         np.concatenate(rest), np.concatenate(faces), starts, sheets, np.concatenate(owner), device
     )
-    return cloth, held, keep, friction
+    return packed, held, keep, friction
 
 
 def make(device: str | None) -> WarpTeacher:
