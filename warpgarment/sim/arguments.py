@@ -75,16 +75,16 @@ def per_garment(value: Any, kind: type, count: int, name: str) -> list:
 
 
 def known_frames(
-    garments: Sequence[Garment], single: bool, first_vertices: Any, history: Any, length: int
+    garments: Sequence[Garment], single: bool, length: int, first_vertices: Any, history: Any
 ) -> np.ndarray:
     """The frames with which a simulation begins, packed: the rest positions, `first_vertices`, or a history.
 
     Args:
         garments: The batch.
         single: Whether the caller gave one garment, and so one array instead of a list.
+        length: Number of frames H of a history.
         first_vertices: First frame of each garment [m], shape [V,3]; or None.
         history: First H frames of each garment [m], shape [H,V,3]; or None.
-        length: Number of frames H of a history.
 
     Returns:
         Positions [m], float32 [K,V,3] with K = 1 or H.

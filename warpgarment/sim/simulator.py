@@ -225,7 +225,7 @@ class Simulator:
         rates = rates_of(unique, out_fps, fps := self.network.config.fps)
         needed = [frames_needed(frames, rate, fps) for rate in rates]
         motions = [b.resampled(fps, count) for b, count in zip(unique, needed, strict=True)]
-        brought = Brought(garments, known_frames(garments, single, *told.starts, length=self.network.config.history))
+        brought = Brought(garments, known_frames(garments, single, self.network.config.history, *told.starts))
         given = len(brought.known)
         shot = bodies_of_shot(unique, rates, frames, garments, on) if any(rate != fps for rate in rates) else None
         lengths = [min(motions[i].frames, needed[i] or 2**62) for i in on]
@@ -317,7 +317,7 @@ class Simulator:
         garments, single = told.garments, told.single
         checked, on = given_bodies(body_vertices, body_faces, len(garments), self.network.config.fps)
         packed = PackedBodies.pack([b.faces for b in checked], [b.vertices.shape[1] for b in checked], on, self.device)
-        brought = Brought(garments, known_frames(garments, single, *told.starts, length=self.network.config.history))
+        brought = Brought(garments, known_frames(garments, single, self.network.config.history, *told.starts))
         first = packed_on([b.vertices[0] for b in checked], self.device)
         known_materials = as_materials(told.materials, len(garments), self.network, self.device)
         air, worn = as_wind(wind, len(garments), self.network, frame=0), outfits(told.layers, on)
