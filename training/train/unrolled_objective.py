@@ -141,8 +141,8 @@ class UnrolledObjective(nn.Module):
             solved, finite = scene.reconstruct(
                 vertices, compose(output, newest, residual=config.residual), features, body
             )
+            solved = scene.relax(solved, finite)
             if self.unroll.collision_passes:
-                solved = scene.relax(solved, finite)
                 origin = scene.contact.origin(vertices, features)
                 solved = scene.contact(solved, body, finite, origin, measure=False)[0]
             yield terms, solved, recorded
