@@ -26,7 +26,7 @@ from .schema import SEQUENCE, faults, is_finite, shown
 from .sequence import MANIFEST, Sequence, check_array_file
 from .set_manifest import planned_numbers, read_checked, read_set_manifest
 
-NOT_SEQUENCES = ("card",)  # other folders that a set may hold
+NOT_SEQUENCES = ("card", "twins")  # other folders that a set may hold
 _HELD_OUT_BY_CATEGORY = ("cloth3d",)  # recipes with held-out categories; outfits and cuts are split otherwise
 
 
