@@ -99,7 +99,9 @@ def make_twins(config: TwinsConfig, *, make: Callable[[str, str | None], Teacher
             refused[folder.name] = str(error)
             print(f"no twin of {error}", file=sys.stderr, flush=True)
     if refused:
-        raise TwinError(f"{len(refused)} of {len(folders)} sequences have no twin, first: {next(iter(refused.values()))}")
+        raise TwinError(
+            f"{len(refused)} of {len(folders)} sequences have no twin, first: {next(iter(refused.values()))}"
+        )
     return done
 
 

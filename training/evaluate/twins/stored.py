@@ -54,7 +54,14 @@ def shape_of(sequence: Sequence) -> Shape:
 
 
 def write_twin(
-    path: Path, sequence: Sequence, twin: np.ndarray, teacher: Mapping[str, Any], *, noise: float, seed: int, replay: float
+    path: Path,
+    sequence: Sequence,
+    twin: np.ndarray,
+    teacher: Mapping[str, Any],
+    *,
+    noise: float,
+    seed: int,
+    replay: float,
 ) -> None:
     """Measures a twin and writes its file, completely or not at all.
 
