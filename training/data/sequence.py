@@ -41,7 +41,8 @@ __all__ = [
 FORMAT = 2
 MANIFEST = "manifest.json"
 MOST_BYTES = 1 << 30  # of an array that is copied into memory
-_LARGE = ("garment_positions", "body_positions", "garment_vertices", "velocity_codes")  # mapped; others would cost an open file each
+# Mapped; others would cost an open file each
+_LARGE = ("garment_positions", "body_positions", "garment_vertices", "velocity_codes")
 _OF_FRAMES = (  # arrays of the body with one entry per frame: format 1, then 2
     "bone_transforms", "bone_rotations", "bone_translations", "bone_origins", "body_positions", "body_boxes",
 )  # fmt: skip

@@ -1,10 +1,10 @@
 """The second part of an evaluation: error over the teacher's own, and how the cloth looks beside the recording.
 
-For every rollout of the network, the figures of `shape` are taken over the predicted frames: those of the network against
-the recording, and where a twin of the sequence is stored (`twins`) those of the twin over the same frames, the floor. The
-excess of a frame is its error minus the twin's distance in that frame; both are kept. Slow and fast parts of the twin
-were divided over the whole recording, those of a rollout over its own frames: within half a second of its ends the two
-are means over different frames.
+For every rollout of the network, the figures of `shape` are taken over the predicted frames: those of the network
+against the recording, and where a twin of the sequence is stored (`twins`) those of the twin over the same frames, the
+floor. The excess of a frame is its error minus the twin's distance in that frame; both are kept. Slow and fast parts of
+the twin were divided over the whole recording, those of a rollout over its own frames: within half a second of its ends
+the two are means over different frames.
 """
 
 from __future__ import annotations
@@ -28,6 +28,21 @@ from .twins.stored import Twin, read_twin, shape_of
 SHARES = ("bending", "acceleration")  # of the recording's
 STRAINS = ("strain_1", "strain_99")
 ERRORS = (*DIFFERENCE, "bias")
+ABOUT = (
+    "Mean distance from the recording [cm]: of all vertices, by quarter of a garment's height, of differences in waves "
+    f"longer (low) and shorter (high) than {100 * WAVELENGTH:.0f} cm over the rest mesh, of their mean over "
+    f"{WINDOW:g} s (slow) and the rest of them (fast), and of their mean over all frames (bias), the last three as the "
+    "garment sees them."
+)
+BOTH = "Each is followed by the same figure of the teacher's twin, where one is stored; excess is the difference."
+NONE = (
+    "No sequence has a twin of the teacher here, so there is no floor. Make twins with "
+    "`python -m warpgarment.training.evaluate.twins --data DATA`."
+)
+LOOK = (
+    "Bending energy (mean squared change of dihedral angles) and acceleration as shares of the recording's; the 1st "
+    "and the 99th percentile of edge strain [%]."
+)
 
 
 class Excess:
@@ -145,19 +160,9 @@ def mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def lines(result: dict[str, Any]) -> list[str]:
     """This part of the evaluation as Markdown."""
     floored = any(found["with_floor"] for found in result["mean"].values())
-    about = (
-        "Mean distance from the recording [cm]: of all vertices, by quarter of each garment's height, of differences in "
-        f"waves longer (low) and shorter (high) than {100 * WAVELENGTH:.0f} cm over the rest mesh, of their mean over "
-        f"{WINDOW:g} s (slow) and the rest of them (fast), and of their mean over all frames (bias), both as the garment "
-        "sees them."
-    )
-    both = " Each is followed by the same figure of the teacher's twin, where one is stored; excess is the difference."
-    none = " No sequence has a twin of the teacher here, so there is no floor: make some with `python -m " + (
-        "warpgarment.training.evaluate.twins --data DATA`."
-    )
     names = ["error", *QUARTERS, "low", "high", "slow", "fast", "bias"]
     headings = ["sequence", "start", *names[:1], *(["excess"] if floored else []), *names[1:]]
-    text = ["## Error over the teacher's own", "", about + (both if floored else none), ""]
+    text = ["## Error over the teacher's own", "", f"{ABOUT} {BOTH if floored else NONE}", ""]
     shown = [("**mean**", start, found) for start, found in result["mean"].items()]
     if floored and result["without_floor"]:
         shown += [("**mean with floor**", start, found) for start, found in result["mean_with_floor"].items()]
@@ -173,12 +178,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     if floored and result["without_floor"]:
         text += [f"{len(result['without_floor'])} without a floor:", ""]
         text += [*(f"- {escape(f'{name}: {why}')}" for name, why in sorted(result["without_floor"].items())), ""]
-    text += ["## How the cloth looks", ""]
-    text += [
-        "Bending energy (mean squared change of dihedral angles) and acceleration as shares of the recording's; the 1st "
-        "and the 99th percentile of edge strain [%].",
-        "",
-    ]
+    text += ["## How the cloth looks", "", LOOK, ""]
     rows = []
     for name, start, found in shown:
         for who, values in (found.get("looks") or {}).items():

@@ -9,14 +9,14 @@ Of the differences d = x - x_recorded of all V vertices, [T,V,3] in metres:
 | slow, fast | mean of |m| and |d' - m|, where m is the mean over one second of d', which is d as the garment sees it |
 | bias | mean over vertices of |mean over all frames of d'| |
 
-P solves (M + s^4 L M^-1 L) P d = M d, with L the cotangent Laplacian of the rest mesh and M its lumped areas, free at all
-borders. A wave of wavelength w keeps the share 1 / (1 + (w_0 / w)^4) of its amplitude, w_0 = 2 pi s = 20 cm: longer waves
-are low, shorter ones high, and |low|^2 + |high|^2 is not |d|^2. d' = R^T d with R the rotation that fits the recorded
-garment best (Kabsch, from rest), so that a garment that is always too far behind its wearer is biased however he turns.
-The second is centred and ends where the frames end.
+P solves (M + s^4 L M^-1 L) P d = M d, with L the cotangent Laplacian of the rest mesh and M its lumped areas, free at
+all borders. A wave of wavelength w keeps the share 1 / (1 + (w_0 / w)^4) of its amplitude, w_0 = 2 pi s = 20 cm: longer
+waves are low, shorter ones high, and |low|^2 + |high|^2 is not |d|^2. d' = R^T d with R the rotation that fits the
+recorded garment best (Kabsch, from rest), so that a garment that always hangs too far behind its wearer is biased in
+whatever direction they walk. The second is centred and ends where the frames end.
 
-Of positions x by themselves: **bending** is the mean over inner edges of the squared change of the dihedral angle against
-the rest mesh [rad^2]; **strain_1**, **strain_99** are percentiles over edges of the relative change of length;
+Of positions x by themselves: **bending** is the mean over inner edges of the squared change of the dihedral angle
+against the rest mesh [rad^2]; **strain_1**, **strain_99** are percentiles over edges of the relative change of length;
 **acceleration** is the mean over vertices of |x(t+1) - 2 x(t) + x(t-1)| fps^2 [m/s^2], NaN in the first frame and the
 last. All is computed in float64.
 """

@@ -144,9 +144,10 @@ class GenerateConfig:
     def command(self) -> str:
         """The command that makes the set again; the folder of clips is left to the user."""
         words = ["warpgarment generate --out DIR"] + (["--motions CLIPS"] if self.motions else [])
+        said = (*_DETERMINING, "velocities", "sequences", "categories", "held_out")
         for option in fields(self):
             value = getattr(self, option.name)
-            if option.name not in (*_DETERMINING, "velocities", "sequences", "categories", "held_out") or value == option.default:
+            if option.name not in said or value == option.default:
                 continue
             shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
             flag = f"--{option.name.replace('_', '-')}"

@@ -4,9 +4,9 @@
     python -m warpgarment.training.evaluate.twins --data DATA --motions CLIPS     # a set made with clips
 
 The distance between a recording and its twin is the floor of the error that `warpgarment evaluate` reports. A scene is
-made from the manifest of its sequence; the teacher must have the settings and versions recorded there. Before the noise,
-the scene is simulated as it was, up to the first recorded frames, and must be where it was recorded. Twins that exist
-are kept, so that an interrupted run goes on where it stopped.
+made from the manifest of its sequence; the teacher must have the settings and versions recorded there. First the scene
+is simulated without noise, up to the first recorded frames, and must be where it was recorded. Twins that exist are
+kept, so that an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
