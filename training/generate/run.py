@@ -208,9 +208,10 @@ def _arrays(attempt: Attempt, manifest: dict[str, Any], config: GenerateConfig) 
     if not frames or (manifest["status"] == "rejected" and not config.keep_rejected):
         return {}
     cut = {k: attempt.arrays[k][:frames] for k in ("bone_transforms", "wind") if k in attempt.arrays}
+    moved = {"garment_vertices": np.stack(attempt.frames[:frames])}
     if attempt.velocities:
-        cut["garment_velocities"] = np.stack(attempt.velocities[:frames])
-    return attempt.arrays | cut | {"garment_vertices": np.stack(attempt.frames[:frames])}
+        moved["garment_velocities"] = np.stack(attempt.velocities[:frames])
+    return attempt.arrays | cut | moved
 
 
 def numbers_to_make(config: GenerateConfig) -> list[int]:

@@ -30,6 +30,7 @@ from .scene import TwinError
 FORMAT = 1
 FOLDER = "twins"  # beside the sequences of a set
 MEASURES = {"wavelength_m": WAVELENGTH, "window_s": WINDOW}
+_ABOUT: tuple[str, ...] = ("noise_mm", "seed", "replay_mm", "teacher", "versions")
 _DIGITS = 5
 
 
@@ -121,7 +122,7 @@ def read_twin(path: Path, sequence: Sequence) -> Twin:
     arrays = {name: np.array([math.nan if v is None else v for v in values]) for name, values in figures.items()}
     if any(array.shape != (len(sequence),) or array.dtype.kind != "f" for array in arrays.values()):
         raise TwinError(f"{sequence.name}: the figures of its twin are not numbers of {len(sequence)} frames. {again}")
-    about = {key: content[key] for key in ("noise_mm", "seed", "replay_mm", "teacher", "versions") if key in content}
+    about = {key: content.get(key) for key in _ABOUT}
     return Twin(about, arrays, {int(k): float(v) for k, v in bias.items() if k.isdigit() and is_finite(v)})
 
 
