@@ -3,6 +3,7 @@
 | what | stored as | largest error |
 | --- | --- | --- |
 | positions | uint16 within the bounding box of their frame | half a step, size / 131,070: 0.008 mm at 1 m |
+| velocities | uint16 within the box of their frame | half a step, range / 131,070: 0.08 mm/s at 10 m/s |
 | rotations | the quaternion over its largest component, the other three in 20 bits: 8 bytes | 4e-6 rad |
 | translations | multiples of 2^-17 m above the frame's lowest, 21 bits a coordinate: 8 bytes | 0.004 mm |
 | skinning weights | 65,535ths that sum to 65,535; that of the last bone is the remainder | 1.6e-5 |
@@ -283,6 +284,7 @@ def decoded(stored: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 _INDICES = ("garment_faces", "body_faces", "pins", "bone_indices")
 _BOXED = {
     "garment_vertices": ("garment_positions", "garment_boxes"),
+    "garment_velocities": ("velocity_codes", "velocity_boxes"),
     "body_vertices": ("body_positions", "body_boxes"),
     "body_rest_vertices": ("body_rest_positions", "body_rest_box"),
 }

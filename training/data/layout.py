@@ -21,6 +21,7 @@ ARRAYS = {
     "garment_starts": "K",  # optional: first vertex of each garment of an outfit, innermost first, and V
     "pins": "P",
     "garment_vertices": "T,V,3",
+    "garment_velocities": "T,V,3",  # optional: at the end of each frame [m/s]
     "body_faces": "G,3",
     "collider_faces": "G",
     "body_rest_vertices": "U,3",  # these four, or body_vertices
@@ -40,6 +41,8 @@ STORED = {
     "pins": (_INDEX, "P"),
     "garment_positions": ("uint16", "T,V,3"),
     "garment_boxes": ("float32", "T,2,3"),
+    "velocity_codes": ("uint16", "T,V,3"),
+    "velocity_boxes": ("float32", "T,2,3"),
     "body_faces": (_INDEX, "G,3"),
     "collider_faces": ("uint8", "ceil(G/8)"),
     "body_rest_positions": ("uint16", "U,3"),
@@ -68,6 +71,7 @@ _STORED_1 = {
     "bone_transforms": ("float32", "T,B,3,4"),
 }
 _OPTIONAL = ("garment_starts", "wind")
+_VELOCITIES = ("velocity_codes", "velocity_boxes")  # both or none
 _PLAIN_BODY = ("body_positions", "body_boxes")
 _SKINNED_BODY = (
     "body_rest_positions", "body_rest_box", "bone_indices", "bone_weights", "bone_rotations", "bone_translations",
@@ -88,6 +92,8 @@ def expected(version: int, present: Collection[str]) -> dict[str, tuple[str, str
         return dict(_STORED_1)
     absent = _SKINNED_BODY if "body_positions" in present else _PLAIN_BODY
     left_out = {*absent, *(name for name in _OPTIONAL if name not in present)}
+    if not any(name in present for name in _VELOCITIES):
+        left_out |= set(_VELOCITIES)
     return {name: value for name, value in STORED.items() if name not in left_out}
 
 

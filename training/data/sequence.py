@@ -41,7 +41,8 @@ __all__ = [
 FORMAT = 2
 MANIFEST = "manifest.json"
 MOST_BYTES = 1 << 30  # of an array that is copied into memory
-_LARGE = ("garment_positions", "body_positions", "garment_vertices")  # mapped; others would cost an open file each
+# Mapped; others would cost an open file each
+_LARGE = ("garment_positions", "body_positions", "garment_vertices", "velocity_codes")
 _OF_FRAMES = (  # arrays of the body with one entry per frame: format 1, then 2
     "bone_transforms", "bone_rotations", "bone_translations", "bone_origins", "body_positions", "body_boxes",
 )  # fmt: skip
@@ -119,6 +120,14 @@ class Sequence:
     def vertices(self) -> np.ndarray:
         """Garment vertices [m], float32 [T, V, 3]. A frame with a number that was not finite is NaN throughout."""
         return self._array("garment_vertices")
+
+    @property
+    def velocities(self) -> np.ndarray | None:
+        """Velocities of the garment at the end of each frame, as the teacher had them [m/s], float32 [T, V, 3].
+
+        None where they were not recorded.
+        """
+        return self._array("garment_velocities") if "velocity_codes" in self._stored else None
 
     @cached_property
     def garment(self) -> Garment:
@@ -227,6 +236,7 @@ class Sequence:
         skinned = {"body_rest_vertices", "bone_indices", "bone_weights", "bone_transforms"}
         left_out = skinned if "body_positions" in self._stored else {"body_vertices"}
         left_out |= {name for name in ("garment_starts", "wind") if name not in self._stored}
+        left_out |= {"garment_velocities"} if "velocity_codes" not in self._stored else set()
         return {name: self._array(name) for name in ARRAYS if name not in left_out}
 
     def _array(self, name: str) -> np.ndarray:

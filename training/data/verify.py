@@ -26,7 +26,8 @@ from .schema import SEQUENCE, faults, is_finite, shown
 from .sequence import MANIFEST, Sequence, check_array_file
 from .set_manifest import planned_numbers, read_checked, read_set_manifest
 
-NOT_SEQUENCES = ("card",)  # other folders that a set may hold
+NOT_SEQUENCES = ("card", "twins")  # other folders that a set may hold
+_OF_FRAMES = ("garment_vertices", "garment_velocities", "wind")
 _HELD_OUT_BY_CATEGORY = ("cloth3d",)  # recipes with held-out categories; outfits and cuts are split otherwise
 
 
@@ -224,7 +225,7 @@ def _content(sequence: Sequence) -> tuple[str, ...]:
     for name, array in arrays.items():
         bad = ~np.isfinite(array)
         if bad.any():
-            where = f" (first: frame {int(np.argwhere(bad)[0][0])})" if name in ("garment_vertices", "wind") else ""
+            where = f" (first: frame {int(np.argwhere(bad)[0][0])})" if name in _OF_FRAMES else ""
             raise MeshError(f"{name} holds {np.count_nonzero(bad):,} values that are not finite{where}")
     sequence.body_in(slice(0, 1)).submesh(arrays["collider_faces"])
     garment = sequence.garment

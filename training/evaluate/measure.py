@@ -8,6 +8,9 @@ the first alone. Only predicted frames count. Baselines start from the newest in
 to the body's surface at their places in the first input frame, as in any simulation; no recorded frame is used after
 the start.
 
+A second part (`excess`) reports the network's error over that of the teacher against itself, by height and by kind, and
+folds, strain and acceleration beside the recording's; its floors are the twins that `evaluate.twins` has made.
+
 The results are `evaluation.json`, `evaluation.md` and `error_over_time.png`, each written completely or not at all. The
 tables use the same function `measure`.
 """
@@ -43,6 +46,10 @@ from warpgarment.training.tables.report import grid
 from warpgarment.training.train.training_set import folders_of
 from warpgarment.view.markdown import code, escape
 
+from .excess import Excess
+from .excess import lines as detail_lines
+from .twins.stored import FOLDER
+
 
 class NoTestData(ValueError):
     """No sequence could be evaluated; the message has the reasons."""
@@ -64,6 +71,7 @@ class EvaluateConfig:
         baselines: Also roll out the baselines.
         device: "cpu", "cuda"; None: a GPU where there is one.
         threads: CPU threads of torch; None leaves torch's own choice.
+        twins: Folder of the teacher's twins of these sequences; None for DATA/twins.
         picture: Draw the error over time (needs matplotlib: extra `train`).
         table: Make one of the paper's tables or figures, or `long`, rollouts of 1,000 frames.
         tables: Options of the tables.
@@ -79,6 +87,7 @@ class EvaluateConfig:
     baselines: bool = True
     device: str | None = None
     threads: int | None = None
+    twins: Path | None = None
     picture: bool = True
     table: TableName | None = None
     tables: tyro.conf.OmitArgPrefixes[TableOptions] = field(default_factory=TableOptions)
@@ -89,8 +98,8 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
 
     Returns:
         `settings`, `network` (file, config, notes), `sequences` (per sequence and start: figures of each method),
-        `mean` (start -> method -> figures), `skipped` (name -> reason), `skipped_count`, `frames_predicted`,
-        `seconds_per_frame`; for tables what `tables.make_table` returns.
+        `mean` (start -> method -> figures), `detail` (see `excess.Excess.result`), `skipped` (name -> reason),
+        `skipped_count`, `frames_predicted`, `seconds_per_frame`; for tables what `tables.make_table` returns.
 
     Raises:
         OptionMissing: There are no data or no output folder.
@@ -115,12 +124,14 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
     simulator = Simulator(checkpoint.load(path), config.device)
     skipped: dict[str, str] = {}
     folders = evenly(folders_of(Path(config.data), config.split, skipped), config.max_sequences)
+    excess = Excess(config.twins or Path(config.data) / FOLDER)
     measured = measure(
         simulator,
         folders,
         frames=config.frames,
         geodesic_frames=config.geodesic_frames,
         baselines=config.baselines,
+        observe=excess.observe,
     )
     skipped |= measured.skipped
     if not measured.rows:
@@ -134,6 +145,7 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         "seconds_per_frame": measured.seconds / max(measured.frames, 1),
         "mean": means(measured.rows),
         "sequences": measured.rows,
+        "detail": excess.result(),
         "skipped": skipped,
         "skipped_count": len(skipped),
     }
@@ -182,6 +194,7 @@ def table(result: dict[str, Any]) -> str:
             if method in row:
                 rows.append([escape(row["sequence"]), row["start"], str(row["frames"]), method, *cells(row[method])])
     lines += [*grid(["sequence", "start", "frames", "method", *headings], rows), ""]
+    lines += detail_lines(result["detail"])
     lines += skipped_lines(result["skipped"])
     return "\n".join(lines).rstrip() + "\n"
 

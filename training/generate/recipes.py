@@ -56,6 +56,8 @@ class GenerateConfig:
         teacher: Physics solver that simulates the sequences.
         materials: "fixed" gives all garments the same cloth, "sampled" each its own; None for the recipe's default.
         wind: Whether there is wind, in about half of the sequences; None for the recipe's default.
+        velocities: Whether the teacher's velocity of each vertex at the end of each frame is recorded, too, for
+            restarts; only Newton knows them. Sequences take almost twice the space, and are the same otherwise.
         seed: Seed of the whole set.
         attempts: Largest number of attempts at a sequence, of which the quality gate may reject some.
         least_frames: Number of good frames; a sequence that fails after more of them is kept up to the failure.
@@ -83,6 +85,7 @@ class GenerateConfig:
     teacher: Literal["newton", "blender", "warp"] = "newton"
     materials: Literal["fixed", "sampled"] | None = None
     wind: bool | None = None
+    velocities: bool = False
     seed: int = 0
     attempts: int = 4
     least_frames: int = 150
@@ -132,6 +135,8 @@ class GenerateConfig:
         values = {k: v for k, v in asdict(self).items() if k in _DETERMINING}
         clips = list_clips(Path(self.motions)) if self.motions else []
         values["clips"] = {p.name: p.stat().st_size for p in clips}
+        if self.velocities:  # sets without say nothing of it, as before there was a choice
+            values["velocities"] = True
         single = self.recipe == "cloth3d"
         chosen = {"categories": list(self.categories), "held_out": list(self.held_out)}
         return values | (chosen if single else {"categories": [], "held_out": []})
@@ -139,12 +144,14 @@ class GenerateConfig:
     def command(self) -> str:
         """The command that makes the set again; the folder of clips is left to the user."""
         words = ["warpgarment generate --out DIR"] + (["--motions CLIPS"] if self.motions else [])
+        said = (*_DETERMINING, "velocities", "sequences", "categories", "held_out")
         for option in fields(self):
             value = getattr(self, option.name)
-            if option.name not in (*_DETERMINING, "sequences", "categories", "held_out") or value == option.default:
+            if option.name not in said or value == option.default:
                 continue
             shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
-            words.append(f"--{option.name.replace('_', '-')} {shown}")
+            flag = f"--{option.name.replace('_', '-')}"
+            words.append(flag if option.name == "velocities" else f"{flag} {shown}")
         return " ".join(words)
 
 

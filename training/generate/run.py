@@ -25,7 +25,7 @@ from warpgarment.io.disk.outputs import check_space, check_writable
 from warpgarment.objects.garment import Garment
 from warpgarment.training.data.sequence import MANIFEST, write_sequence
 from warpgarment.training.data.set_manifest import package_versions, write_set_manifest
-from warpgarment.training.teachers import ClothScene, Teacher, TeacherError, make_teacher
+from warpgarment.training.teachers import ClothScene, Moving, MovingTeacher, Teacher, TeacherError, make_teacher
 
 from .placement import body_motion, clothed
 from .quality import Limits, QualityGate
@@ -45,6 +45,7 @@ class Attempt:
         arrays: Arrays to store in addition to the garments' frames.
         gate: Quality gate that measures the frames.
         frames: Garment vertices of the good frames [m], float32 [V, 3] each.
+        velocities: Velocities in these frames [m/s], float32 [V, 3] each; none if they are not recorded.
         garments: Garments at rest, innermost first.
         body_frames: Vertices of the body [m], float32 [T, U, 3].
         began: Clock at the start of the work [s].
@@ -56,6 +57,7 @@ class Attempt:
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     gate: QualityGate | None = None
     frames: list[np.ndarray] = field(default_factory=list)
+    velocities: list[np.ndarray] = field(default_factory=list)
     garments: tuple[Garment, ...] = ()
     body_frames: np.ndarray | None = None
     began: float = field(default_factory=time.perf_counter)
@@ -95,26 +97,46 @@ def prepare(plan: Plan, config: GenerateConfig) -> Attempt:
     return attempt
 
 
-def simulate(attempts: list[Attempt], teacher: Teacher) -> None:
-    """Simulates attempts side by side until each is complete or rejected."""
+def check_velocities(teacher: Teacher) -> MovingTeacher:
+    """A teacher, if it knows velocities.
+
+    Raises:
+        TeacherError: It does not.
+    """
+    if not isinstance(teacher, MovingTeacher):
+        raise TeacherError(f"{teacher.name} gives no velocities. Leave --velocities out, or choose --teacher newton.")
+    return teacher
+
+
+def simulate(attempts: list[Attempt], teacher: Teacher, *, velocities: bool = False) -> None:
+    """Simulates attempts side by side until each is complete or rejected.
+
+    Raises:
+        TeacherError: Velocities are wanted and the teacher has none.
+    """
     live = [a for a in attempts if a.reason is None]
     if not live:
         return
     scenes = [a.scene for a in live if a.scene is not None]  # of all live attempts, which were prepared without fault
-    stream: Iterator[Sequence[np.ndarray | None]]
-    if len(live) == 1:
+    stream: Iterator[Sequence[Moving | np.ndarray | None]]
+    if velocities:
+        stream = check_velocities(teacher).simulate_moving(scenes)
+    elif len(live) == 1:
         stream = ([vertices] for vertices in teacher.simulate(scenes[0]))
     else:
         stream = teacher.simulate_many(scenes)
     for frame, worlds in enumerate(stream):
-        for attempt, vertices in zip(live, worlds, strict=True):
-            if vertices is None or attempt.reason:
+        for attempt, shown in zip(live, worlds, strict=True):
+            if shown is None or attempt.reason:
                 continue
+            vertices = shown.vertices if isinstance(shown, Moving) else shown
             assert attempt.gate is not None  # made with the scene, as the frames are
             assert attempt.body_frames is not None
             attempt.reason = attempt.gate.check(frame, vertices, attempt.body_frames[frame])
             if not attempt.reason:
                 attempt.frames.append(vertices)
+                if isinstance(shown, Moving):
+                    attempt.velocities.append(shown.velocities)
         if all(a.reason for a in live):
             break
 
@@ -150,7 +172,7 @@ def manifest_of(attempt: Attempt, config: GenerateConfig, teacher: Teacher) -> d
         "frames": kept,
         "figures": attempt.gate.figures(kept) if attempt.gate else {},
         "seconds": round(time.perf_counter() - attempt.began, 1),
-    }
+    } | ({"velocities": True} if config.velocities else {})
 
 
 def make_sequences(config: GenerateConfig, numbers: list[int]) -> list[dict[str, Any]]:
@@ -164,7 +186,7 @@ def make_sequences(config: GenerateConfig, numbers: list[int]) -> list[dict[str,
     pending = list(numbers)
     for number in range(first, last + 1):
         attempts = [prepare(plan_sequence(config, n, number), config) for n in pending]
-        simulate(attempts, teacher)
+        simulate(attempts, teacher, velocities=config.velocities)
         pending = []
         for attempt in attempts:
             manifest = manifest_of(attempt, config, teacher) | {"versions": versions}
@@ -186,7 +208,10 @@ def _arrays(attempt: Attempt, manifest: dict[str, Any], config: GenerateConfig) 
     if not frames or (manifest["status"] == "rejected" and not config.keep_rejected):
         return {}
     cut = {k: attempt.arrays[k][:frames] for k in ("bone_transforms", "wind") if k in attempt.arrays}
-    return attempt.arrays | cut | {"garment_vertices": np.stack(attempt.frames[:frames])}
+    moved = {"garment_vertices": np.stack(attempt.frames[:frames])}
+    if attempt.velocities:
+        moved["garment_velocities"] = np.stack(attempt.velocities[:frames])
+    return attempt.arrays | cut | moved
 
 
 def numbers_to_make(config: GenerateConfig) -> list[int]:
@@ -214,12 +239,15 @@ def generate(config: GenerateConfig) -> Path:
     config = replace(config, out=Path(config.out), motions=Path(config.motions) if config.motions else None)
     check_writable(config.out, folder=True)
     numbers, planned = numbers_to_make(config), range(config.first, config.first + config.sequences)
-    check_space(config.out, len(numbers) * config.frames * (BYTES_OF_FACE * config.faces + BYTES_OF_BODY))
+    bytes_of_face = BYTES_OF_FACE * (1 + config.velocities)
+    check_space(config.out, len(numbers) * config.frames * (bytes_of_face * config.faces + BYTES_OF_BODY))
     if config.make_blender:
         from warpgarment.training.teachers.blender.environment import make_environment
 
         make_environment()
     teacher = make_teacher(config.teacher, "cpu" if config.ray else config.device)  # raises errors before any work
+    if config.velocities:
+        check_velocities(teacher)
     if config.bodies == "anny":
         from warpgarment.training.bodies.anny import anny_bodies
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -106,6 +106,18 @@ class ClothScene:
         return np.concatenate([[0], np.cumsum([len(c.garment.vertices) for c in self.cloths])])
 
 
+class Moving(NamedTuple):
+    """A frame of a scene.
+
+    Attributes:
+        vertices: Positions [m], float32 [V, 3], cloths end to end.
+        velocities: Velocities at the end of the frame [m/s], float32 [V, 3], as the solver would go on with them.
+    """
+
+    vertices: np.ndarray
+    velocities: np.ndarray
+
+
 class Teacher(Protocol):
     """Simulates cloth."""
 
@@ -127,6 +139,15 @@ class Teacher(Protocol):
 
     def settings(self) -> dict[str, Any]:
         """Settings and versions on which the result depends besides the scene, as plain values for a manifest."""
+        ...
+
+
+@runtime_checkable
+class MovingTeacher(Protocol):
+    """What a teacher has in addition if it knows velocities. Newton does; Blender's cloth keeps them to itself."""
+
+    def simulate_moving(self, scenes: list[ClothScene]) -> Iterator[list[Moving | None]]:
+        """As `Teacher.simulate_many`, with the same positions, and the velocities at the end of each frame."""
         ...
 
 

@@ -107,3 +107,20 @@ def test_ray_makes_the_same(made, config, tmp_path):
     generate(other)
     first, second = (read_manifest(next(p.glob("00000_*"))) for p in (made, other.out))
     assert first["checksums"] == second["checksums"]
+
+
+def test_velocities_are_an_addition(made, config, tmp_path):
+    """With velocities, sequences are others, cannot be told from those without, or are mixed with them in one set."""
+    with_them = replace(config, out=tmp_path, velocities=True, first=1, sequences=1)
+    generate(with_them)
+    one, other = (Sequence.load(next(root.glob("00001_*"))) for root in (made, tmp_path))
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    assert one.velocities is None
+    assert other.manifest["velocities"] is True
+    assert "velocities" not in one.manifest
+    mean = np.diff(other.vertices, axis=0) * 30.0  # over a frame, of ten substeps: not that at its end
+    assert np.abs(other.velocities[1:] - mean).mean() < 0.3 * np.abs(mean).mean()
+    assert "--velocities" in with_them.command()
+    assert verify(tmp_path).problems == []
+    with pytest.raises(DatasetMismatch, match="velocities was null, is true"):
+        generate(replace(with_them, out=made))

@@ -31,7 +31,7 @@ import warp as wp
 
 from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.kernels.wind import add_air_forces
-from warpgarment.training.teachers import ClothScene
+from warpgarment.training.teachers import ClothScene, Moving
 from warpgarment.training.teachers.scenes import check_scenes
 
 from .settings import NewtonSettings, layer_friction
@@ -83,8 +83,8 @@ class NewtonTeacher:
             TeacherError: The scene cannot be simulated; the message has the reason.
         """
         check_scenes([scene])
-        for (vertices,) in self._run([scene]):
-            yield vertices
+        for (frame,) in self._run([scene]):
+            yield frame.vertices
 
     def simulate_many(self, scenes: Sequence[ClothScene]) -> Iterator[list[np.ndarray | None]]:
         """Simulates several scenes at once, each in a world of its own.
@@ -100,19 +100,24 @@ class NewtonTeacher:
         Raises:
             TeacherError: A scene cannot be simulated; the message has its number and the reason.
         """
+        for worlds in self.simulate_moving(scenes):
+            yield [None if frame is None else frame.vertices for frame in worlds]
+
+    def simulate_moving(self, scenes: Sequence[ClothScene]) -> Iterator[list[Moving | None]]:
+        """As :meth:`simulate_many`, with velocities: those of the last substep, from which the next one starts."""
         check_scenes(scenes)
         models: dict[tuple[float, int, float], list[int]] = {}
         for number, scene in enumerate(scenes):
             models.setdefault((scene.fps, scene.settle, layer_friction(scene, self._settings)), []).append(number)
         running = [(members, self._run([scenes[m] for m in members])) for members in models.values()]
         for frame in range(max(map(len, scenes), default=0)):
-            shown: list[np.ndarray | None] = [None] * len(scenes)
+            shown: list[Moving | None] = [None] * len(scenes)
             for members, stream in running:
-                for m, vertices in zip(members, next(stream, [None] * len(members)), strict=True):
-                    shown[m] = vertices if frame < len(scenes[m]) else None
+                for m, moving in zip(members, next(stream, [None] * len(members)), strict=True):
+                    shown[m] = moving if frame < len(scenes[m]) else None
             yield shown
 
-    def _run(self, scenes: list[ClothScene]) -> Iterator[list[np.ndarray]]:
+    def _run(self, scenes: list[ClothScene]) -> Iterator[list[Moving]]:
         """Frames of scenes that fit one model, until the longest ends."""
         newton, options, device = self._newton, self._settings, wp.get_device(self._device)
         worlds = Worlds(newton, scenes, options, device)
@@ -169,15 +174,15 @@ class NewtonTeacher:
                         graphs[id(now)] = capture.graph
                     wp.capture_launch(graphs[id(now)])
                 now, later = later, now
-            vertices_of_worlds = worlds.end_frame(frame, now)
-            for w, vertices in enumerate(vertices_of_worlds):
+            moving = worlds.end_frame(frame, now)
+            for w, (vertices, velocities) in enumerate(moving):
                 if w not in aside and not np.isfinite(vertices).all():
                     aside.add(w)
                     worlds.put_aside(w, now, later)
                 if w in aside:
-                    vertices_of_worlds[w] = np.full_like(vertices, np.nan)
+                    moving[w] = Moving(np.full_like(vertices, np.nan), np.full_like(velocities, np.nan))
             if frame >= settle:
-                yield vertices_of_worlds
+                yield moving
 
 
 def make(device: str | None) -> NewtonTeacher:

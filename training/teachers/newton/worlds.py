@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warpgarment.training.teachers import ClothScene
+from warpgarment.training.teachers import ClothScene, Moving
 from warpgarment.training.teachers.scenes import MovingFrame, bound_to_body, used_body
 
 from .kernels import set_bodies_kernel, set_pins_kernel
@@ -146,6 +146,11 @@ class Worlds:
             )
         for mesh in self._meshes:
             mesh.refit()  # Warp silently skips this inside a captured CPU graph
+        self._place_pins(state)
+        return self._air[part]
+
+    def _place_pins(self, state: Any) -> None:
+        """Writes the positions and velocities of the pins that are tied to bodies."""
         if self._pins:
             wp.launch(
                 set_pins_kernel,
@@ -154,16 +159,18 @@ class Worlds:
                 outputs=[state.particle_q, state.particle_qd],
                 device=self.device,
             )
-        return self._air[part]
 
-    def end_frame(self, frame: int, state: Any) -> list[np.ndarray]:
-        """Vertices of each world at the end of a frame [m], float32 [V, 3]."""
-        points = state.particle_q.numpy()
-        vertices = []
+    def end_frame(self, frame: int, state: Any) -> list[Moving]:
+        """Vertices [m] and velocities [m/s] of each world at the end of a frame; those of the last substep."""
+        self._place_pins(state)  # the solver leaves pins where they are, but without their velocities
+        points, speeds = state.particle_q.numpy(), state.particle_qd.numpy()
+        origin_velocities = self._origin_velocity.numpy()[-len(self.scenes) :]
+        worlds = []
         for w, path in enumerate(self._frames):
-            of_world = points[self.starts[w] : self.starts[w + 1]]
-            vertices.append((of_world + path.origin(frame + 1.0)).astype(np.float32))
-        return vertices
+            part = slice(self.starts[w], self.starts[w + 1])
+            vertices = (points[part] + path.origin(frame + 1.0)).astype(np.float32)
+            worlds.append(Moving(vertices, speeds[part] + origin_velocities[w]))
+        return worlds
 
     def put_aside(self, world: int, *states: Any) -> None:
         """Removes a world that has become NaN from the simulation: its particles rest at their start positions."""
