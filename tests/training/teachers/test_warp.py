@@ -189,6 +189,17 @@ def test_many_scenes_give_what_each_gives_alone():
         np.testing.assert_array_equal(np.stack(mine[: len(scene)]), np.stack(alone))
 
 
+def test_velocities_are_those_of_the_last_step():
+    """A restart would go on with another motion: with one step a frame, the difference of two frames."""
+    scene = flag(5, gravity=(0.0, 0.0, -9.81))
+    frames = [one[0] for one in WarpTeacher(replace(FAST, substeps=1)).simulate_moving([scene])]
+    positions, velocities = (np.stack([getattr(f, name) for f in frames]) for name in ("vertices", "velocities"))
+    expected = np.diff(positions.astype(np.float64), axis=0) * 30.0
+    assert np.abs(expected).max() > 0.5
+    np.testing.assert_allclose(velocities[1:], expected, atol=1e-5)  # float32 positions of 0.3 m
+    assert (velocities[:, scene.cloths[0].garment.pins] == 0).all()
+
+
 def test_bdf2_keeps_more_of_a_swing():
     """The second scheme would be the first one: a sheet that swings loses less of its height."""
     scene = flag(30, gravity=(0.0, 0.0, -9.81))

@@ -16,7 +16,7 @@ from warpgarment.errors import UsageError
 from warpgarment.kernels.launch import as_warp, torch_stream
 from warpgarment.kernels.physics import ImplicitSolver, PhysicsCloth, Sheet
 from warpgarment.kernels.wind import add_air_forces
-from warpgarment.training.teachers import ClothScene
+from warpgarment.training.teachers import ClothScene, Moving
 from warpgarment.training.teachers.scenes import check_scenes
 
 from .bodies import MovingBodies
@@ -57,8 +57,8 @@ class WarpTeacher:
             TeacherError: The scene cannot be simulated; the message has the reason.
         """
         check_scenes([scene])
-        for (vertices,) in self._run([scene]):
-            yield vertices
+        for (frame,) in self._run([scene]):
+            yield frame.vertices
 
     def simulate_many(self, scenes: Sequence[ClothScene]) -> Iterator[list[np.ndarray | None]]:
         """Simulates several scenes at once; those of equal frame rate and settling time in one batch.
@@ -69,19 +69,24 @@ class WarpTeacher:
         Raises:
             TeacherError: A scene cannot be simulated; the message has its number and the reason.
         """
+        for shown in self.simulate_moving(scenes):
+            yield [None if frame is None else frame.vertices for frame in shown]
+
+    def simulate_moving(self, scenes: Sequence[ClothScene]) -> Iterator[list[Moving | None]]:
+        """As :meth:`simulate_many`, with velocities: those from which the next step starts."""
         check_scenes(scenes)
         batches: dict[tuple[float, int], list[int]] = {}
         for number, scene in enumerate(scenes):
             batches.setdefault((scene.fps, scene.settle), []).append(number)
         running = [(members, self._run([scenes[m] for m in members])) for members in batches.values()]
         for frame in range(max(map(len, scenes), default=0)):
-            shown: list[np.ndarray | None] = [None] * len(scenes)
+            shown: list[Moving | None] = [None] * len(scenes)
             for members, stream in running:
-                for m, vertices in zip(members, next(stream, [None] * len(members)), strict=True):
-                    shown[m] = vertices if frame < len(scenes[m]) else None
+                for m, moving in zip(members, next(stream, [None] * len(members)), strict=True):
+                    shown[m] = moving if frame < len(scenes[m]) else None
             yield shown
 
-    def _run(self, scenes: list[ClothScene]) -> Iterator[list[np.ndarray]]:
+    def _run(self, scenes: list[ClothScene]) -> Iterator[list[Moving]]:
         """Frames of scenes of equal frame rate and settling time, until the longest ends."""
         options, device = self._settings, self._device
         starts = np.cumsum([0] + [int(scene.starts[-1]) for scene in scenes])
@@ -122,9 +127,9 @@ class WarpTeacher:
                 acceleration = gravity + air.acceleration(points, speed, wind)
                 target = motion.target(acceleration)
                 guess = motion.guess()
-                pinned, at = bodies.pins(share)
+                pinned, held_at = bodies.pins(share)
                 target[still], guess[still] = points[still], points[still]
-                target[pinned], guess[pinned] = at, at
+                target[pinned], guess[pinned] = held_at, held_at
                 if bodies.any:
                     planes = bodies.planes(guess, share, 1.0 / options.substeps)
                     solver.friction.copy_(coefficient * pressed(solver, points))
@@ -140,8 +145,8 @@ class WarpTeacher:
                 end = solver.solve()
                 motion.advance(meeting.safe(end) if meeting else end.clone())
             if frame >= settle:
-                shown = motion.points.float().cpu().numpy()
-                yield [shown[a:b] for a, b in itertools.pairwise(starts)]
+                at, going = (t.float().cpu().numpy() for t in (motion.points, motion.velocity))
+                yield [Moving(at[a:b], going[a:b]) for a, b in itertools.pairwise(starts)]
 
 
 def pressed(solver: ImplicitSolver, points: torch.Tensor) -> torch.Tensor:
