@@ -10,7 +10,8 @@ last m pairs s = x' - x, y = g' - g correct it (Nocedal and Wright 2006, algorit
     `direct`    the other half;  d = -r, t = 1, trial = x + d
 
 A group whose trial was refused keeps its direction; its part of the linear solve is not used. A pair without positive
-curvature s·y is left out. A group whose largest step is below the tolerance is done, and stays.
+curvature s·y, or of a move that is mere rounding, is left out. A group whose step is below the
+tolerance is done, and stays.
 
 | symbol | code | what |
 | --- | --- | --- |
@@ -31,6 +32,8 @@ DECREASE = wp.constant(wp.float64(1e-4))
 """Share of the decrease along the slope that a step must reach (Armijo)."""
 ROUNDING = wp.constant(wp.float64(1e-13))
 """Increase, as a share of the energy, that is taken for rounding."""
+LEAST = wp.constant(wp.float64(1e-9))
+"""Root of the mean square of a move [m] below which its pair is rounding, and left out."""
 SMALLEST = wp.constant(wp.float64(1e-3))
 """Share of a direction below which it is given up."""
 
@@ -121,6 +124,7 @@ def accept_kernel(
     if accepted:
         slot = (newest + 1) % memory
         curved = wp.float64(0.0)
+        moved = wp.float64(0.0)
         if started:
             i = first + lane
             while i < last:
@@ -129,8 +133,11 @@ def accept_kernel(
                 search.moves[slot, i] = s
                 search.changes[slot, i] = y
                 curved += wp.dot(s, y)
+                moved += wp.dot(s, s)
                 i += wp.block_dim()
         curved = block_sum(curved)
+        if block_sum(moved) < LEAST * LEAST * wp.float64(last - first):
+            curved = wp.float64(0.0)
         i = first + lane
         while i < last:
             search.point[i] = trial[i]

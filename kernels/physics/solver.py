@@ -62,6 +62,7 @@ class ImplicitSolver:
             Those found before a solve count in it.
         pair_distance: Distance that pairs keep [m].
         pair_stiffness: Stiffness of a pair [N/m].
+        pair_friction: Coulomb coefficient of each face against others, float64 [F]; None: 0.
 
     Attributes:
         contact: Stiffness of contact of each vertex [N/m], float64 [V].
@@ -86,6 +87,7 @@ class ImplicitSolver:
         pairs: Contacts | None = None,
         pair_distance: float = 0.004,
         pair_stiffness: float = 20.0,
+        pair_friction: torch.Tensor | None = None,
     ) -> None:
         device, count = cloth.mass.device, len(cloth.mass)
         if not (inertia > 0 and iterations > 0 and memory > 0):
@@ -111,7 +113,7 @@ class ImplicitSolver:
             return allocate(shape, torch.float64, device)
 
         faces, hinges, groups = len(cloth.faces), len(cloth.hinges), self._groups
-        self.positions, self.target, self.anchor, self.normal = (rows(count, 3) for _ in range(4))
+        self.positions, self.target, self.anchor, self.normal, self.before = (rows(count, 3) for _ in range(5))
         self.offset, self.distance, self.friction = (rows(count) for _ in range(3))
         self.strain, self.angle = rows(faces, 3), rows(hinges)
         self._more = rows(count, 3)
@@ -140,7 +142,7 @@ class ImplicitSolver:
             memory,
             tolerance,
             keep_pairs,
-            (pairs, pair_distance, pair_stiffness),
+            (pairs, pair_distance, pair_stiffness, pair_friction),
         )
 
     def _recorded(
@@ -152,7 +154,7 @@ class ImplicitSolver:
         memory: int,
         tolerance: float,
         keep_pairs: bool,
-        springs: tuple[Contacts | None, float, float],
+        springs: tuple[Contacts | None, float, float, torch.Tensor | None],
     ) -> dict[str, Any]:
         """Launches of a solve, by name, with their arguments."""
         cloth, device = self.cloth, wp.device_from_torch(self._device)
@@ -210,16 +212,19 @@ class ImplicitSolver:
         }
         if not hinges:
             del commands["angle"], commands["bending"]
-        pairs, distance, stiffness_of_pair = springs
+        pairs, distance, stiffness_of_pair, coefficient = springs
         if pairs is not None:
             found = [as_warp(t, wp.vec3) for t in (pairs.normal, pairs.weights_p, pairs.weights_q)]
-            self._kept += [pairs, *found]
-            inputs = [pairs.model, distance, stiffness_of_pair, *found, trial]
+            coefficient = self._energies[0].new_zeros(faces) if coefficient is None else coefficient
+            rubbed, before = as_warp(coefficient, wp.float64), as_warp(self.before, wp.vec3d)
+            self._kept += [pairs, *found, rubbed, before]
+            inputs = [pairs.model, distance, stiffness_of_pair, rubbed, slip, before, *found, trial]
             commands["pairs"] = record(pair_kernel, faces, inputs, [energies[0], more])
         return commands
 
     def remember(self) -> None:
-        """Takes strain and angles of `positions` as those at the start of the step, for damping."""
+        """Takes `positions` as those at the start of the step, for damping and for friction between pairs."""
+        self.before.copy_(self.positions)
         with torch_stream(self._device):
             for name in ("strain", "angle"):
                 if name in self._commands:

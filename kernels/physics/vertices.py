@@ -3,10 +3,8 @@
     W = ½ c m |x - y|² + ½ k a max(0, d - n·(x - u))² + μ p f(|t|),    t = (I - n nᵀ) (x - x⁻ - Δu)
 
 The first term makes the minimum the end of an implicit step, for a scheme with y and c. The second one keeps the
-distance d from the plane through u across n. The third is friction, smooth at rest (Li et al. 2020, "Incremental
-Potential Contact", section 5) with the pressure p of the step before:
-
-    f(s) = s - ε / 3,   and for s < ε:  s² / ε - s³ / (3 ε²)
+distance d from the plane through u across n. The third is friction (friction.py) with the pressure p of the step
+before.
 
 | symbol | code | what |
 | --- | --- | --- |
@@ -23,6 +21,8 @@ Potential Contact", section 5) with the pressure p of the step before:
 from __future__ import annotations
 
 import warp as wp
+
+from .friction import friction_energy, friction_gradient
 
 
 @wp.kernel(enable_backward=False)
@@ -65,14 +65,8 @@ def vertex_kernel(
         if friction[i] > zero:
             slid = x - anchor[i]
             slid -= wp.dot(n, slid) * n
-            s = wp.length(slid)
-            if s < slip:
-                r = s / slip
-                w += friction[i] * s * (r - r * r / wp.float64(3.0))
-                g += (friction[i] * (wp.float64(2.0) - r) / slip) * slid
-            else:
-                w += friction[i] * (s - slip / wp.float64(3.0))
-                g += (friction[i] / s) * slid
+            w += friction_energy(slid, friction[i], slip)
+            g += friction_gradient(slid, friction[i], slip)
     g += more[i]
     more[i] = wp.vec3d()
     for e in range(corner_start[i], corner_start[i + 1]):

@@ -144,7 +144,7 @@ class Teacher(Protocol):
 
 @runtime_checkable
 class MovingTeacher(Protocol):
-    """What a teacher has in addition if it knows velocities. Newton and Warp do; Blender's cloth keeps them to itself."""
+    """What a teacher has in addition if it knows velocities. Newton and Warp do; Blender's keeps them to itself."""
 
     def simulate_moving(self, scenes: list[ClothScene]) -> Iterator[list[Moving | None]]:
         """As `Teacher.simulate_many`, with the same positions, and the velocities at the end of each frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from reference.finite_differences import numeric_gradient
 from reference.physics import energies as reference
@@ -12,11 +13,13 @@ from warpgarment.kernels.cloth.contacts import Contacts
 from warpgarment.kernels.cloth.pairs import FacePairs, Outfits
 from warpgarment.kernels.physics import ImplicitSolver, PhysicsCloth, Sheet
 
-DISTANCE, STIFFNESS = 0.01, 30.0
+DISTANCE, STIFFNESS, SLIP = 0.01, 30.0, 5e-4
+FRICTION = (0.2, 0.6)
 
 
-def test_energy_and_gradient_of_pairs():
-    """Layers would attract each other, or push by another force than the energy's.
+@pytest.mark.parametrize("moved", [0.0, 2e-4, 3e-3], ids=["at rest", "sticking", "sliding"])
+def test_energy_and_gradient_of_pairs(moved):
+    """Layers would attract each other, push by another force than the energy's, or rub the wrong way.
 
     Two triangles 6 mm apart, one tilted, with no stiffness of their own worth mentioning.
     """
@@ -38,8 +41,18 @@ def test_energy_and_gradient_of_pairs():
     pairs.find(tensor, tensor, torch.ones(2, dtype=torch.bool))
     contacts.find(tensor, tensor)
     solver = ImplicitSolver(
-        cloth, inertia=1.0, iterations=1, pairs=contacts, pair_distance=DISTANCE, pair_stiffness=STIFFNESS
+        cloth,
+        inertia=1.0,
+        iterations=1,
+        slip=SLIP,
+        pairs=contacts,
+        pair_distance=DISTANCE,
+        pair_stiffness=STIFFNESS,
+        pair_friction=torch.tensor(FRICTION, dtype=torch.float64),
     )
+    before = points - np.repeat([[0.6 * moved, -0.8 * moved, 0.0], [0.0, 0.0, 0.0]], 3, axis=0)
+    solver.positions.copy_(torch.from_numpy(before))
+    solver.remember()
     start = torch.from_numpy(points)
     solver.target.copy_(start)
     solver.positions.copy_(start)
@@ -54,7 +67,7 @@ def test_energy_and_gradient_of_pairs():
     assert np.allclose(n, gap / np.linalg.norm(gap), atol=1e-5)
 
     def energy(x: np.ndarray) -> float:
-        return reference.pair_energy(x, one, other, u, v, n, DISTANCE, STIFFNESS)
+        return reference.pair_energy(x, one, other, u, v, n, DISTANCE, STIFFNESS, before, sum(FRICTION) / 2, SLIP)
 
     assert energy(points) > 1e-5
     # float32 weights and directions enter both; the sheet's own energy at float32 rest positions is below 1e-12 J

@@ -90,7 +90,9 @@ def friction_energy(vertices, normal, anchor, friction, slip) -> float:
     return total
 
 
-def pair_energy(vertices, first, second, u, v, normal, distance, stiffness) -> float:
-    """A spring between a point of one face and a point of another."""
-    gap = normal @ (u @ vertices[first] - v @ vertices[second])
-    return 0.5 * stiffness * max(0.0, distance - gap) ** 2
+def pair_energy(vertices, first, second, u, v, normal, distance, stiffness, before, friction, slip) -> float:
+    """A spring between a point of one face and a point of another, and friction with the spring's force before."""
+    way, start = (u @ points[first] - v @ points[second] for points in (vertices, before))
+    force = friction * stiffness * max(0.0, distance - normal @ start)
+    rubbed = friction_energy(way[None], normal[None], start[None], [force], slip)
+    return 0.5 * stiffness * max(0.0, distance - normal @ way) ** 2 + rubbed

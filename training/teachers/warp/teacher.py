@@ -111,6 +111,7 @@ class WarpTeacher:
             pairs=meeting.contacts if meeting else None,
             pair_distance=options.self_margin,
             pair_stiffness=options.self_stiffness,
+            pair_friction=torch.from_numpy(friction[cloth.faces[:, 0].cpu().numpy()]).to(device),
         )
         motion = _Motion(points, options.scheme, step)
         air = _Air(cloth, scene_of_vertex, options, device)
