@@ -18,6 +18,7 @@ from warpgarment.errors import MeshError
 
 _ROOM = "warpgarment"
 NOT_FREE = 3  # exit status where a result was written that is not free of crossings
+JOBS_FAILED = 4  # exit status where some jobs of a list failed
 _EXTRAS = {
     "newton": "physics",
     "gpytoolbox": "physics",
@@ -94,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0; 2 where the user has to change something, which one line on stderr names; 1 for a fault of
         the program, where the line says in which file its traceback is kept; 3 where a result was written, and garments
-        that should not cross do, or were not all looked at.
+        that should not cross do, or were not all looked at; 4 where some jobs of a list failed.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
@@ -132,19 +133,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def spoken(**options: str) -> Iterator[None]:
+def spoken(where: str = "", /, **options: str) -> Iterator[None]:
     """Lets errors and warnings about files name options of the command line instead of Python's arguments.
 
     Warnings are printed, each as a line.
 
     Args:
+        where: What a warning is about, before its text: the line of a list of jobs.
         options: The option for each argument, such as ``mesh="--body-mesh"``.
     """
 
     from warpgarment.geometry.checks import REMEDY
     from warpgarment.geometry.seams import REMEDY as SEWING
 
-    argument = re.compile(rf'(?<![\w-])({"|".join(options)})=(?:"([^"]*)"|True\b)?')
+    argument = re.compile(rf'(?<![\w-])({"|".join(options) or "(?!)"})=(?:"([^"]*)"|True\b)?')
 
     def translated(text: str) -> str:
         if "clean" in options:
@@ -160,7 +162,7 @@ def spoken(**options: str) -> Iterator[None]:
             raise MeshError(translated(str(error))) from error
         finally:
             for warning in dict.fromkeys(translated(str(w.message)) for w in heard):
-                print(f"warpgarment: {' '.join(warning.split())}", file=sys.stderr)
+                print(f"warpgarment: {where}{' '.join(warning.split())}", file=sys.stderr)
 
 
 def _options(verb: Verb, name: str, arguments: Sequence[str]) -> object:
@@ -170,8 +172,8 @@ def _options(verb: Verb, name: str, arguments: Sequence[str]) -> object:
     return tyro.cli(config, prog=f"warpgarment {name}", args=list(arguments), description=verb.summary)
 
 
-def _own_up(error: Exception) -> int:
-    """Keeps the traceback of a fault of the program in a file, and says in which."""
+def kept_traceback(error: Exception) -> str:
+    """Keeps the traceback of a fault of the program in a file; returns in words where it is."""
     import tempfile
     import traceback
 
@@ -183,9 +185,23 @@ def _own_up(error: Exception) -> int:
             file.write(f"warpgarment {' '.join(sys.argv[1:])}\n\n{text}")
     except OSError:
         print(text, file=sys.stderr, end="")  # nowhere to keep it
-        where = "its traceback is above"
+        return "its traceback is above"
+    return f"its traceback is in {file.name}"
+
+
+def explained(error: Exception) -> str:
+    """An error as the text of one line: what it is and the remedy that it names, or where its traceback is."""
+    if isinstance(error, OSError) or type(error).__module__.startswith(_ROOM):
+        text = f"{type(error).__name__}: {error}"
     else:
-        where = f"its traceback is in {file.name}"
+        fault = f"a fault of the program, not of its input: {type(error).__name__}: {error}"
+        text = f"{fault}; {kept_traceback(error)}. Please report it."
+    return " ".join(text.split())
+
+
+def _own_up(error: Exception) -> int:
+    """Says that the program is at fault, and where the traceback is."""
+    where = kept_traceback(error)
     _complain(f"a fault of the program, not of its input: {type(error).__name__}: {error}; {where}. Please report it.")
     return 1
 

@@ -22,13 +22,13 @@ LARGEST = 16 << 20  # bytes of a table of wind
 NONE = "none"  # a garment without a material
 
 
-def materials_of(words: Sequence[str], count: int) -> list[Material | None]:
+def materials_of(words: Sequence[Any], count: int) -> list[Material | None]:
     """A material, or None, for each garment; an empty list if none is given.
 
     Args:
         words: Of each garment, or once for all: the name of a preset ("cotton"), assignments ("density=0.3,bend=1e-3"),
             a preset and assignments ("cotton,bend=0.01"), "none", or a .json file with an object of assignments, or a
-            list of objects, names and nulls.
+            list of objects, names and nulls. In lists of jobs also an object of assignments, or None for "none".
         count: Number of garments.
 
     Raises:
@@ -36,7 +36,10 @@ def materials_of(words: Sequence[str], count: int) -> list[Material | None]:
     """
     found: list[Material | None] = []
     for word in words:
-        found += _from_file(Path(word)) if word.lower().endswith(".json") else [_from_word(word)]
+        if isinstance(word, str):
+            found += _from_file(Path(word)) if word.lower().endswith(".json") else [_from_word(word)]
+        else:
+            found.append(_from_item("--material", word))
     if len(found) == 1:
         return found * count
     if found and len(found) != count:
@@ -71,20 +74,22 @@ def _from_file(path: Path) -> list[Material | None]:
         raise UsageError(f"--material: {error}") from None
     found: list[Material | None] = []
     for item in held if isinstance(held, list) else [held]:
-        if item is None or isinstance(item, str):
-            found.append(None if item is None else _from_word(item))
-            continue
-        numbers = isinstance(item, dict) and all(
-            isinstance(value, (int, float)) and not isinstance(value, bool) for value in item.values()
-        )
-        if not numbers:
-            raise UsageError(
-                f"--material {path}: {str(item)[:60]} is no object of numbers, such as {{'density': 0.3}}."
-            )
-        found.append(_material(f"--material {path}", "", item))
+        found.append(_from_item(f"--material {path}", item))
     if not found:
         raise UsageError(f"--material {path}: an empty list. Give a material for each garment.")
     return found
+
+
+def _from_item(where: str, item: Any) -> Material | None:
+    """The material of a value of JSON."""
+    if item is None or isinstance(item, str):
+        return None if item is None else _from_word(item)
+    numbers = isinstance(item, dict) and all(
+        isinstance(value, (int, float)) and not isinstance(value, bool) for value in item.values()
+    )
+    if not numbers:
+        raise UsageError(f"{where}: {str(item)[:60]} is no object of numbers, such as {{'density': 0.3}}.")
+    return _material(where, "", item)
 
 
 def _material(where: str, named: str, values: dict[str, Any]) -> Material:

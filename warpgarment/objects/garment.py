@@ -106,6 +106,7 @@ class Garment:
         clean: bool = False,
         mesh: str | None = None,
         up: str | None = None,
+        pins: Any = None,
     ) -> Garment:
         """Reads a garment from .obj, .ply, .off, .stl, .glb, .gltf, .npz or .usd (.usda, .usdc, .usdz).
 
@@ -125,6 +126,7 @@ class Garment:
             mesh: Name of the mesh to read where a file holds several: a prim of USD, an object or group of OBJ, a node
                 or mesh of glTF. "*" reads everything in OBJ and glTF as one.
             up: Axis that points up in the file, "y" or "z". None is Y, except that USD files say it themselves.
+            pins: Vertices of the file to tie to the body's surface, integers, shape [P]; None for those of the file.
 
         Raises:
             MeshError: The file is not of its kind, is truncated, or holds a mesh that the constructor refuses.
@@ -140,7 +142,8 @@ class Garment:
         path = Path(path)
         data = read_mesh(path, unit=unit, mesh=mesh, up=up)
         try:
-            told: dict[str, Any] = {"pins": data.pins, "name": data.name or path.stem, "surface": data.surface}
+            held = data.pins if pins is None else pins
+            told: dict[str, Any] = {"pins": held, "name": data.name or path.stem, "surface": data.surface}
             garment = (
                 cls.cleaned_from(data.vertices, data.faces, **told, keep=True)
                 if clean

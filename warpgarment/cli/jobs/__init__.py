@@ -1,0 +1,1 @@
+"""Many shots in one run: `warpgarment simulate --jobs jobs.jsonl`."""
