@@ -54,6 +54,8 @@ KINDS: dict[str, Kind] = {
     "usdc": Kind(meshes.write_usdc, meshes.motion, outside=True),
     "usdz": Kind(meshes.write_usdz, meshes.motion, outside=True),
     "pc2": Kind(meshes.write_pc2, meshes.motion),
+    "abc": Kind(meshes.write_abc, meshes.motion),
+    "mdd": Kind(meshes.write_mdd, meshes.motion),
     "npz_garment": Kind(meshes.write_garment_npz, meshes.garment),
     "npz_motion": Kind(meshes.write_motion_npz, meshes.motion),
     "npz_body": Kind(meshes.write_body_npz, meshes.body),

@@ -333,6 +333,20 @@ def write_pc2(folder: Path) -> Path:
     return folder / "a.pc2"
 
 
+def write_abc(folder: Path) -> Path:
+    """An Alembic archive of a mesh in motion."""
+    vertices, faces = tube(8, 4, 0.3)
+    GarmentMotion(moved(vertices), faces, 24.0, (), "dress", start=2.0).save(folder / "a.abc")
+    return folder / "a.abc"
+
+
+def write_mdd(folder: Path) -> Path:
+    """A cache with the time of each frame, and its mesh."""
+    vertices, faces = tube(8, 4, 0.3)
+    GarmentMotion(moved(vertices), faces, 24.0, (), "dress", start=2.0).save(folder / "a.mdd")
+    return folder / "a.mdd"
+
+
 def write_garment_npz(folder: Path) -> Path:
     """A garment with pins."""
     vertices, faces = tube()

@@ -61,7 +61,7 @@ class PoissonSolver:
         rest_vertices: Rest positions [m], float32 [V,3], on the device of the solver.
         faces: Vertex indices, int32 [F,3].
         pins: Vertices held by soft constraints, integers [P], no vertex twice.
-        pin_weight: Stiffness of a pin, in units of the mean diagonal entry of the Laplacian.
+        pin_weight: Stiffness of a pin, in units of the mean diagonal entry of its component's Laplacian.
         tolerance: Error in the energy norm at which conjugate gradients stop, as a share of the diagonal of the
             component's rest bounding box. The default keeps every vertex within 1e-5 of that diagonal of the direct
             solution.
@@ -106,7 +106,10 @@ class PoissonSolver:
         vertex_component, face_component, count = components(vertex_count, host_faces)
         diagonal = matrix.diagonal()
         stiffness = np.zeros(vertex_count)
-        stiffness[pins] = pin_weight * (diagonal[diagonal > 0].mean() if len(host_faces) else 1.0)
+        for component in np.unique(vertex_component[pins]):  # each its own, so that a batch changes none of them
+            of_component = vertex_component == component
+            usual = diagonal[of_component & (diagonal > 0)]
+            stiffness[pins[vertex_component[pins] == component]] = pin_weight * (usual.mean() if len(usual) else 1.0)
         pin_of_vertex = np.full(vertex_count, -1, np.int32)
         pin_of_vertex[pins] = np.arange(len(pins), dtype=np.int32)
         pins_in_component = np.bincount(vertex_component[pins], minlength=count).astype(np.float64)

@@ -43,7 +43,7 @@ def test_npz_gives_everything_back(tmp_path):
     assert wg.GarmentMotion.load(tmp_path / "bare.npz").status == []
 
 
-@pytest.mark.parametrize("target", ["m.npz", "m.usd", "m.usda", "m.usdc", "m.pc2", "folder"])
+@pytest.mark.parametrize("target", ["m.npz", "m.usd", "m.usda", "m.usdc", "m.pc2", "m.mdd", "m.abc", "folder"])
 def test_every_format_reads_back_bit_for_bit(tmp_path, target):
     """Float32 positions would be rounded or reordered in a format."""
     result = motion(frames=12)
@@ -57,7 +57,7 @@ def test_every_format_reads_back_bit_for_bit(tmp_path, target):
     assert not [p for p in tmp_path.rglob("*") if "partial" in p.name]
 
 
-@pytest.mark.parametrize("target", ["m.npz", "m.usd", "m.usda", "m.usdc", "m.pc2", "folder"])
+@pytest.mark.parametrize("target", ["m.npz", "m.usd", "m.usda", "m.usdc", "m.pc2", "m.mdd", "m.abc", "folder"])
 def test_a_garment_motion_reads_back_what_it_saved(tmp_path, target):
     """A result that was written for another program cannot be measured any more: bit for bit, with the rate where the
     format has one, and in another unit or at another rate where asked."""
@@ -75,7 +75,7 @@ def test_a_garment_motion_reads_back_what_it_saved(tmp_path, target):
     assert small.fps == 12.0
 
 
-@pytest.mark.parametrize("target", ["m.npz", "m.usdc", "m.pc2", "folder"])
+@pytest.mark.parametrize("target", ["m.npz", "m.usdc", "m.pc2", "m.mdd", "m.abc", "folder"])
 def test_a_rollout_that_failed_reads_back(tmp_path, target):
     """A result that ends in NaN, as one that went wrong does, can be written but not read."""
     result = motion()
@@ -166,7 +166,7 @@ def _fail(*args, **kwargs):
     raise OSError("disk full")
 
 
-@pytest.mark.parametrize("target", ["m.npz", "m.usdc", "m.pc2", "folder"])
+@pytest.mark.parametrize("target", ["m.npz", "m.usdc", "m.pc2", "m.mdd", "m.abc", "folder"])
 @pytest.mark.parametrize("broken", ["fsync", "replace"])
 def test_a_write_that_fails_leaves_the_old_result_and_no_rubbish(tmp_path, monkeypatch, target, broken):
     """A full disk would leave half a file that looks like a result."""
@@ -176,7 +176,7 @@ def test_a_write_that_fails_leaves_the_old_result_and_no_rubbish(tmp_path, monke
     if broken == "fsync":
         real, calls = os.fsync, []
         monkeypatch.setattr(os, "fsync", lambda fd: _fail() if calls else (calls.append(fd), real(fd)))
-        if target in ("m.npz", "m.usdc"):
+        if target in ("m.npz", "m.usdc", "m.abc"):
             calls.append(0)  # a single file: the first flush fails
     else:
         monkeypatch.setattr(os, "replace", _fail)
@@ -231,8 +231,8 @@ def test_other_peoples_folders_are_not_replaced(tmp_path):
     with pytest.raises(FileExistsError, match=r"thesis\.txt"):
         motion().save(tmp_path / "notes")
     assert (tmp_path / "notes" / "thesis.txt").read_text() == "years of work"
-    with pytest.raises(ValueError, match=r"\.abc"):
-        motion().save(tmp_path / "m.abc")
+    with pytest.raises(ValueError, match=r"\.xyz"):
+        motion().save(tmp_path / "m.xyz")
 
 
 def test_folders_of_frames_must_agree(tmp_path):

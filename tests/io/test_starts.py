@@ -21,7 +21,7 @@ kinds = pytest.mark.parametrize("kind", [wg.BodyMotion, wg.GarmentMotion])
 
 
 @kinds
-@pytest.mark.parametrize("name", ["m.npz", "m.usda", "m.usdc", "m.pc2", "folder"])
+@pytest.mark.parametrize("name", ["m.npz", "m.usda", "m.usdc", "m.abc", "m.pc2", "folder"])
 @pytest.mark.parametrize("fps", RATES)
 def test_every_format_says_when_the_motion_starts(tmp_path, kind, name, fps):
     """Frame 1001 would be frame 0 of the next program. In seconds, to a hundredth of a frame."""

@@ -25,6 +25,8 @@ _EXTRAS = {
     "anny": "bodies",
     "mannequin": "bodies",
     "pxr": "usd",
+    "alembic3d": "alembic",
+    "imath": "alembic",
     "pyvista": "window",
     "imageio": "view",
     "imageio_ffmpeg": "view",

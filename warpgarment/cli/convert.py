@@ -21,10 +21,10 @@ class Convert:
     """Options of `convert`."""
 
     input: tyro.conf.Positional[Path]
-    """Motion to read: .npz, .usd, .glb, .pc2 (with its .obj beside it), or a folder of .obj."""
+    """Motion to read: .npz, .usd, .abc, .glb, .pc2 or .mdd (with its .obj beside it), or a folder of .obj."""
     output: tyro.conf.Positional[Output]
-    """Motion to write: .npz, .usd (.usda, .usdc), .glb, .pc2, or a folder of .obj. Polygons, UVs, materials and groups
-    stay, as far as the format has them."""
+    """Motion to write: .npz, .usd (.usda, .usdc), .abc, .glb, .pc2, .mdd, or a folder of .obj. Polygons, UVs, materials
+    and groups stay, as far as the format has them."""
     fps: float | None = None
     """Resample to this rate; by default the rate stays. The motion begins and ends when it did."""
     input_fps: float | None = None

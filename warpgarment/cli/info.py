@@ -24,7 +24,7 @@ class Info:
     """Options of `info`."""
 
     file: tyro.conf.Positional[Path]
-    """A garment, a body or a motion: .obj, .ply, .off, .stl, .glb, .npz, .usd, .pc2, or a folder of .obj."""
+    """Garment, body or motion: .obj, .ply, .off, .stl, .glb, .npz, .usd, .abc, .pc2, .mdd, or a folder of .obj."""
     mesh: str | None = None
     """Name of the object, where the file holds several; by default each of them."""
     unit: str | None = None

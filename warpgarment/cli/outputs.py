@@ -13,10 +13,14 @@ import tyro
 from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.io.disk.atomic import check_replaceable
 from warpgarment.io.disk.outputs import check_writable, names_folder
-from warpgarment.io.files import format_of
+from warpgarment.io.files import CACHES, format_of
 from warpgarment.io.folder import FRAME
 
-_MODULES = {"usd": ("pxr",), "view": ("imageio", "imageio_ffmpeg", "PIL")}  # what an extra brings
+_MODULES = {
+    "usd": ("pxr",),
+    "alembic": ("alembic3d",),
+    "view": ("imageio", "imageio_ffmpeg", "PIL"),
+}  # what an extra brings
 
 
 class Folder(type(Path())):  # type: ignore[misc]  # the class of this system's paths
@@ -48,10 +52,10 @@ def check_output(path: Path, suffixes: Sequence[str], inputs: Sequence[Path | No
     Args:
         path: As it was typed: one with a slash at its end, or of a folder that exists, is a folder's.
         suffixes: What can be written, "" being a folder.
-        inputs: Files that are read: the mesh that is written beside a .pc2 must not be one of them, or beside one.
+        inputs: Files that are read: the mesh that is written beside a cache must not be one of them, or beside one.
 
     Raises:
-        UsageError: No such format, or the mesh beside a .pc2 would replace an input.
+        UsageError: No such format, or the mesh beside a cache would replace an input.
         OutputError, FileExistsError: The name or the folder, see `io.disk.outputs`.
         MissingExtra: What writes it is not installed.
     """
@@ -65,13 +69,13 @@ def check_output(path: Path, suffixes: Sequence[str], inputs: Sequence[Path | No
     check_writable(plain, folder=suffix == "")
     if suffix == "":
         check_replaceable(plain, FRAME)
-    if suffix == ".pc2":
+    if suffix in CACHES:
         mesh = plain.with_suffix(".obj")  # beside it
         check_writable(mesh)
-        read = [p.with_suffix(".obj") if p.suffix.lower() == ".pc2" else p for p in inputs if p is not None]
+        read = [p.with_suffix(".obj") if p.suffix.lower() in CACHES else p for p in inputs if p is not None]
         if mesh.exists() and any(p.exists() and mesh.samefile(p) for p in read):
             raise UsageError(
-                f"{path}: {mesh.name} is read, and the mesh of a .pc2, its first frame, would be written over it. "
+                f"{path}: {mesh.name} is read, and the mesh of a {suffix}, its first frame, would be written over it. "
                 "Choose another name."
             )
     format = None if suffix in (".png", ".mp4") else format_of(suffix)

@@ -31,11 +31,12 @@ class Shot:
 
     files: tyro.conf.Positional[Files] = ()
     """First the rest mesh of each garment, innermost first, draped on the body's first frame (or see --fit-rest): .obj,
-    .ply, .glb, .usd, .npz. Last the body's motion: .npz, .usd, .glb, .pc2 with its .obj beside it, a folder of .obj."""
+    .ply, .glb, .usd, .abc, .npz. Last the body's motion: .npz, .usd, .abc, .glb, .pc2 or .mdd with its .obj beside it,
+    a folder of .obj."""
     out: Output | None = None
-    """Where to write: .usd, .glb, .pc2, .npz, or a folder of .obj (no suffix). Polygons, UVs, materials and groups of
-    the garment's file stay; glTF has triangles only, and normals are left to whoever shows the result. Several garments
-    go into one .usd, or each into its own file, with {name} for its name: out/{name}.pc2."""
+    """Where to write: .usd, .abc, .glb, .pc2, .mdd, .npz, or a folder of .obj (no suffix). Polygons, UVs, materials
+    and groups of the garment's file stay; glTF has triangles only, and normals are left to whoever shows the result.
+    Several garments go into one .usd, or each into its own file, with {name} for its name: out/{name}.pc2."""
     layers: bool = False
     """Keep garments from crossing each other and themselves. The exit status is 3 if the result is not free of
     crossings, or not all of it was looked at."""

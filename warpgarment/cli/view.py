@@ -28,7 +28,7 @@ class View:
     """Options of `view`."""
 
     motion: tyro.conf.Positional[tuple[Path, ...]]
-    """Garment motions: .npz, .usd, .glb, .pc2 with its .obj beside it, or folders of .obj."""
+    """Garment motions: .npz, .usd, .abc, .glb, .pc2 or .mdd with its .obj beside it, or folders of .obj."""
     mesh: str | None = None
     """Name of the mesh to read where the motions' files hold several."""
     fps: float | None = None

@@ -26,10 +26,13 @@ FORMATS: dict[tuple[str, ...], str] = {
     (".npz",): "warpgarment.io.npz",
     (".stl",): "warpgarment.io.stl",
     (".glb", ".gltf"): "warpgarment.io.gltf",
+    (".abc",): "warpgarment.io.alembic",
     (".usd", ".usda", ".usdc", ".usdz"): "warpgarment.io.usd",
     (".pc2",): "warpgarment.io.pc2",
+    (".mdd",): "warpgarment.io.caches.mdd",
     ("",): "warpgarment.io.folder",
 }
+CACHES = (".pc2", ".mdd")  # of positions alone, with a mesh of the same name beside them
 ASSUMED = 30.0  # frames a second where nobody says
 BIGGEST, SMALLEST = 10.0, 0.05  # sizes [m] beyond which a garment's unit is probably another
 
@@ -125,7 +128,7 @@ def whole_output(path: Path, mesh: str | None) -> str | None:
 
     What `write_motion` writes is one mesh, and keeps the names of the objects that its input was made of.
     """
-    return ALL if mesh is None and (path.is_dir() or path.suffix.lower() == ".pc2") else mesh
+    return ALL if mesh is None and (path.is_dir() or path.suffix.lower() in CACHES) else mesh
 
 
 def rate_of(path: Path, data: MotionData, fps: float | None) -> float:

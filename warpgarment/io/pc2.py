@@ -8,27 +8,19 @@ from __future__ import annotations
 
 import os
 import struct
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from warpgarment.errors import MeshError
-from warpgarment.io.disk.atomic import atomic_files
 from warpgarment.io.disk.plain import open_plain
-from warpgarment.io.surface.obj import OBJ_KEEPS, obj_files
-from warpgarment.io.surface.record import say_left_out
 
-from .data import Format, Holds, MotionData, ReadOptions
-from .obj import chosen_polygons, obj_holds, read_polygons, surface_of
-from .parts import unnamed
-from .ply import read_ply
-from .polygons import triangulate_counts
+from .caches.beside import covered, holds_beside, mesh_of, write_covered
+from .data import Format, MotionData, ReadOptions
 
 HEADER = struct.Struct("<12siiffi")
 SIGNATURE = b"POINTCACHE2\0"
-FAR = 2.0  # how much an edge is stretched, beyond which it is another one
 
 
 class PointCache(NamedTuple):
@@ -88,67 +80,14 @@ def write_pc2_to(path: Path, vertices: np.ndarray, *, start: float = 0.0, sampli
 
 
 def _read(path: Path, options: ReadOptions) -> MotionData:
-    """The cache, with the faces of the mesh of the same name beside it."""
-    beside = [path.with_suffix(suffix) for suffix in (".obj", ".OBJ", ".ply", ".PLY")]
-    mesh = next((candidate for candidate in beside if candidate.exists()), None)
-    if mesh is None:
-        raise MeshError(
-            f"{path}: a point cache has no faces; put {path.stem}.obj, with the same vertex order, beside it."
-        )
+    mesh_of(path)
     cache = read_pc2(path)
-    if mesh.suffix.lower() == ".ply":
-        unnamed(path, options.mesh)
-        ply = read_ply(mesh)
-        rest, faces, surface = ply.vertices, ply.faces, ply.surface
-        count, used = len(rest), np.arange(len(rest))
-    else:
-        found = read_polygons(mesh)
-        used, rest, counts, corners = chosen_polygons(mesh, found, options.mesh)
-        count, faces = len(found.vertices), triangulate_counts(rest, counts, corners)
-        surface = surface_of(mesh, found, options.mesh, used)
-    if count != cache.vertices.shape[1]:
-        raise MeshError(f"{path} has {cache.vertices.shape[1]:,} points and {mesh.name} {count:,} vertices.")
-    vertices = cache.vertices[:, used]
-    _warn_about_order(path, mesh, rest, vertices[0], faces)
+    vertices, faces, surface = covered(path, cache.vertices, options)
     return MotionData(vertices, faces, step=cache.sampling, start=cache.start / cache.sampling, surface=surface)
 
 
-def _warn_about_order(path: Path, mesh: Path, rest: np.ndarray, first: np.ndarray, faces: np.ndarray) -> None:
-    """Warns where the edges of the first frame are far from those of the mesh, as they are in another order.
-
-    What the two have in common is looked for in the ratios of lengths: cloth and skin stretch by some per cent, and a
-    unit changes all of them alike.
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    before, after = (np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (rest.astype(float), first))
-    real = (before > 0) & np.isfinite(after)
-    if not real.any():
-        return
-    ratio = after[real] / before[real]
-    middle = float(np.median(ratio))
-    odd = (ratio > FAR * middle) | (ratio < middle / FAR)
-    if middle == 0 or odd.mean() > 0.2:
-        warnings.warn(
-            f"{path}: {np.count_nonzero(odd):,} of {len(ratio):,} edges have another length in the first frame than in "
-            f"{mesh.name}, by more than a factor of {FAR:g}: its vertices seem to be in another order.",
-            UserWarning,
-            stacklevel=6,
-        )
-
-
 def _write(path: Path, data: MotionData) -> None:
-    """The cache, and its first frame as .obj of the same name beside it, which holds what a cache cannot."""
-    say_left_out(path, data.surface, sets=1, keeps=OBJ_KEEPS)
-    texts = obj_files(path.with_suffix(".obj"), data.vertices[0], data.faces, data.name, data.surface)
-    with atomic_files(*texts, path) as (*files, cache):
-        for file, text in zip(files, texts.values(), strict=True):
-            file.write_text(text, encoding="utf-8")
-        write_pc2_to(cache, data.vertices, start=data.start or 0.0)
+    write_covered(path, data, lambda cache: write_pc2_to(cache, data.vertices, start=data.start or 0.0))
 
 
-def _holds(path: Path) -> Holds:
-    beside = next((p for p in (path.with_suffix(".obj"), path.with_suffix(".OBJ")) if p.exists()), None)
-    return obj_holds(beside) if beside else Holds()
-
-
-FORMAT = Format(read_motion=_read, write_motion=_write, named=True, holds=_holds)
+FORMAT = Format(read_motion=_read, write_motion=_write, named=True, holds=holds_beside)

@@ -1,4 +1,4 @@
-"""Which time codes of a stage are read as frames, and how many of them are a second."""
+"""Which time codes of a stage are read as frames, and how many of them are a second; frames of caches in seconds."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from warpgarment.errors import MeshError
 
 SLOWEST, FASTEST = 12.0, 240.0  # time codes a second that are taken for frames; others are seconds or ticks
 SMOOTH = 24.0  # frames a second, at least, at which rotations between far samples are followed
+NTSC = tuple(1000.0 * rate / 1001.0 for rate in (24, 30, 60, 120))
 LONGEST = 20_000  # frames in which nothing moves, before the first time sample or after the last
 
 
@@ -96,3 +97,57 @@ def _snapped(codes: np.ndarray, samples: np.ndarray, step: float) -> np.ndarray:
         return codes
     near = samples[np.clip(np.searchsorted(samples, codes - 1e-3 * step), 0, len(samples) - 1)]
     return np.where(np.abs(near - codes) < 1e-3 * step, near, codes)
+
+
+class Moments(NamedTuple):
+    """Frames per second of evenly spaced frames, None where that cannot be told; time of the first [s]."""
+
+    fps: float | None
+    start: float
+
+
+def moments(times: np.ndarray, precision: float, where: str) -> Moments:
+    """The rate and the start of frames whose times a file has.
+
+    A rate that differs from a whole one, or one of NTSC, by the rounding of the times is that one; so is a start from a
+    whole frame.
+
+    Args:
+        times: Times of the frames [s], shape [T].
+        precision: Largest relative error of the file's numbers.
+        where: The file, for messages.
+
+    Warns:
+        UserWarning: The times do not grow, or are not evenly spaced; then there is no rate.
+    """
+    seconds = np.asarray(times, dtype=np.float64)
+    first = float(seconds[0])
+    if len(seconds) < 2:
+        return Moments(None, first if np.isfinite(first) else 0.0)
+    span = float(seconds[-1] - seconds[0])
+    error = 4.0 * precision * float(np.abs(seconds).max())
+    gap = span / (len(seconds) - 1)
+    if not np.isfinite(seconds).all() or gap <= error:
+        if np.isfinite(seconds).all() and span == 0.0:
+            return Moments(None, first)  # a writer that leaves them out
+        _say_uneven(where)
+        return Moments(None, 0.0)
+    if np.abs(seconds - (seconds[0] + gap * np.arange(len(seconds)))).max() > 0.02 * gap + error:
+        _say_uneven(where)
+        return Moments(None, 0.0)
+    fps, off = 1.0 / gap, error / span
+    rates = ((float(round(fps)), max(1e-5, off)), *((rate, max(1e-7, off)) for rate in NTSC))
+    near = [rate for rate, far in rates if rate and abs(rate - fps) <= far * fps]
+    fps = min(near, key=lambda rate: abs(rate - fps)) if near else fps
+    number = round(first * fps)
+    close = abs(first * fps - number) <= max(1e-3, error * fps)
+    return Moments(fps, number / fps if close else first)
+
+
+def _say_uneven(where: str) -> None:
+    warnings.warn(
+        f"{where}: its frames are not evenly spaced in time, or their times do not grow: the times are left out. Give "
+        "the rate with fps=.",
+        UserWarning,
+        stacklevel=7,
+    )

@@ -125,7 +125,8 @@ class BodyMotion:
         - ``.npz`` with `vertices` [T,V,3], `faces` [F,3] and `fps`;
         - ``.npz`` with `rest_vertices`, `faces`, `bone_indices`, `bone_weights`, `bone_transforms`, `fps` and, if
           parts such as hands are no colliders, `collider_faces` (bool, [F]);
-        - ``.pc2`` with a mesh of the same name beside it (``.obj``, else ``.ply``);
+        - ``.abc``: a mesh of an Alembic archive (extra ``alembic``);
+        - ``.pc2`` or ``.mdd`` with a mesh of the same name beside it (``.obj``, else ``.ply``); MDD says its times;
         - ``.usd``, ``.usda``, ``.usdc``, ``.usdz``: a mesh with time samples;
         - a folder of ``.obj`` files with the same faces, at the numbers in their names;
         - any mesh file that `Garment.load` reads, as a single frame.
@@ -168,7 +169,7 @@ class BodyMotion:
             raise MeshError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes the motion as .npz, .usd (.usda, .usdc), .glb, .pc2 with .obj beside it, or a folder of .obj files.
+        """Writes the motion as .npz, .usd (.usda, .usdc), .abc, .glb, .pc2 or .mdd with .obj, or a folder of .obj.
 
         The output is written completely or not at all, with the time of the first frame as `GarmentMotion.save` has it.
 

@@ -121,10 +121,12 @@ class GarmentMotion:
         - ``.npz``: positions, faces, rate, start [s], status and name; `load` reads all formats, this one without loss;
         - ``.usd``, ``.usda``, ``.usdc``: one mesh with a time sample per frame (extra ``usd``), Y up, metres; time
           codes are frames, and the first one is `start` x `fps`: 1001 for a shot that starts there;
+        - ``.abc``: an Alembic archive (extra ``alembic``), with frames at their times in seconds;
         - ``.glb``, ``.gltf``: triangles with a morph target per frame, which an animation shows one after another, from
           `start` on;
         - ``.pc2``: a point cache, as of Blender, with the first frame as ``.obj`` of the same name beside it; the
           header says at which frame it starts;
+        - ``.mdd``: the same for LightWave, Maya and Houdini, with the time of each frame in seconds;
         - no suffix, or a slash at the end: a folder ``frame_1001.obj``, ``frame_1002.obj``, ..., the first number being
           `start` x `fps` (with a warning where that is not whole); an existing folder is replaced if it holds nothing
           else.

@@ -41,7 +41,7 @@ def dead_process() -> int:
     return process.pid
 
 
-@pytest.mark.parametrize("name", ["m.npz", "m.pc2", "m.usda", "m.usdc"])
+@pytest.mark.parametrize("name", ["m.npz", "m.pc2", "m.mdd", "m.abc", "m.usda", "m.usdc"])
 def test_a_full_disk_is_a_named_error_and_the_old_file_stays(tmp_path, small_disk, name):
     """A full disk would end in a traceback, in half a file, or in the loss of the old one."""
     old = tmp_path / name

@@ -18,7 +18,7 @@ from warpgarment.errors import MeshError, MissingExtra, UsageError
 from warpgarment.io.data import UNITS
 from warpgarment.io.disk.outputs import names_folder
 from warpgarment.io.disk.plain import JSON_DEEPEST, read_plain
-from warpgarment.io.files import listed, suffixes
+from warpgarment.io.files import CACHES, listed, suffixes
 
 LARGEST = 256 << 20  # bytes of a list
 LONGEST_LINE = 1 << 20  # characters of a job
@@ -326,11 +326,8 @@ def written_by(known: Checked) -> list[Path]:
     found: list[Path] = []
     for path in dict.fromkeys(map(str, known.outputs.values())):
         plain = Path(path)
-        found += [plain, *([plain.with_suffix(".obj")] if plain.suffix.lower() in BESIDE else [])]
+        found += [plain, *([plain.with_suffix(".obj")] if plain.suffix.lower() in CACHES else [])]
     return found
-
-
-BESIDE = (".pc2", ".mdd")  # caches, whose mesh is written beside them
 
 
 def _plain(value: Any) -> Any:

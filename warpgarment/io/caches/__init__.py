@@ -1,0 +1,1 @@
+"""Caches of positions alone: the mesh that has their faces lies beside them, under the same name."""
