@@ -42,7 +42,8 @@ def solve(
     result = np.zeros((len(rest), 3))
     stiffness = np.zeros(len(rest))
     if pins is not None:
-        stiffness[pins] = pin_weight * laplacian.diagonal().mean()
+        diagonal, piece = laplacian.diagonal(), piece_of(len(rest), faces)
+        stiffness[pins] = [pin_weight * diagonal[piece == piece[pin]].mean() for pin in pins]
         right[pins] += stiffness[pins, None] * pin_targets.astype(np.float64)
     matrix = (laplacian + sp.diags(stiffness)).tocsc()
     piece = piece_of(len(rest), faces)
