@@ -1,12 +1,13 @@
 """The Warp teacher beside Newton 10 x 5, frame by frame in turns, and both beside their own most converged runs.
 
-    python -m benchmarks.teachers.converged                   # three garments, 40 frames: ten minutes
+    python -m benchmarks.teachers.converged                      # three garments of jersey, 30 frames: five minutes
+    python -m benchmarks.teachers.converged --material default   # of the default material, which is far stiffer
     python -m benchmarks.teachers.converged --frames 20 --newton-converged   # and Newton 20 x 20, which is slow
 
 For each garment: time of a frame (processor time, least, without the first), mean distance of vertices from the same
 solver's most converged run, and the floor below which that distance means nothing: the distance of the converged run
 from its twin, which starts from positions with 0.1 mm of noise. Deepest vertex in the body, crossing triangle pairs
-and stretch are counted without the kernels that are judged. Results are in benchmarks/results/teachers_converged.md.
+and stretch are counted without the kernels that are judged. Results are in benchmarks/results/teachers_converged_MATERIAL.md.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from benchmarks.measure import RESULTS, machine
 from benchmarks.teacher import world
 from benchmarks.teachers_side_by_side import figures, scenes
 from warpgarment.io.disk.atomic import atomic_files
+from warpgarment.objects.material import Material
 from warpgarment.training.tables.outfits.crossings import crossing_pairs
 from warpgarment.training.teachers import ClothScene, Teacher
 from warpgarment.training.teachers.newton.settings import NewtonSettings
@@ -113,7 +115,8 @@ def compared(name: str, scene: ClothScene, newton_converged: bool) -> list[list[
 def main() -> None:
     """Simulates, measures and writes the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--material", default="jersey", help="a preset, or default")
     parser.add_argument("--newton-converged", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
@@ -123,6 +126,9 @@ def main() -> None:
         "dress, remeshed": world(1100, options.frames, 0),
         "dress, finer": world(1836, options.frames, 0),
     }
+    material = Material() if options.material == "default" else Material.preset(options.material)
+    for name, scene in made.items():
+        made[name] = replace(scene, cloths=tuple(replace(cloth, material=material) for cloth in scene.cloths))
     rows = [row for name, scene in made.items() for row in compared(name, scene, options.newton_converged)]
     about = ", ".join(f"{k} {v}" for k, v in machine(torch.device("cpu")).items())
     lines = [
@@ -130,11 +136,11 @@ def main() -> None:
         "",
         about,
         "",
-        f"`python -m benchmarks.teachers.converged --frames {options.frames}`",
+        f"`python -m benchmarks.teachers.converged --material {options.material} --frames {options.frames}`",
     ]
     lines += ["", *table(list(HEADINGS), rows, text=3)]
     options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "teachers_converged.md"
+    path = options.out / f"teachers_converged_{options.material}.md"
     with atomic_files(path) as (written,):
         written.write_text("\n".join(lines) + "\n")
     print(f"written {path}")
