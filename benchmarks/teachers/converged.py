@@ -7,7 +7,7 @@
 For each garment: time of a frame (processor time, least, without the first), mean distance of vertices from the same
 solver's most converged run, and the floor below which that distance means nothing: the distance of the converged run
 from its twin, which starts from positions with 0.1 mm of noise. Deepest vertex in the body, crossing triangle pairs
-and stretch are counted without the kernels that are judged. Results are in benchmarks/results/teachers_converged_MATERIAL.md.
+and stretch are counted without the kernels that are judged. Results: benchmarks/results/teachers_converged_MATERIAL.md.
 """
 
 from __future__ import annotations
