@@ -194,7 +194,8 @@ def table(result: dict[str, Any]) -> str:
             if method in row:
                 rows.append([escape(row["sequence"]), row["start"], str(row["frames"]), method, *cells(row[method])])
     lines += [*grid(["sequence", "start", "frames", "method", *headings], rows), ""]
-    lines += detail_lines(result["detail"])
+    if "detail" in result:  # evaluations of before have none
+        lines += detail_lines(result["detail"])
     lines += skipped_lines(result["skipped"])
     return "\n".join(lines).rstrip() + "\n"
 
