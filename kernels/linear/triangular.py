@@ -21,7 +21,7 @@ from collections.abc import Callable
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, as_warp, torch_stream
+from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .factor import Factor
@@ -264,27 +264,18 @@ def recorded(
 ) -> Callable[[], None]:
     """`solve` on the same tensors again and again: a function that launches it, at a fraction of the host's time.
 
-    The arguments are those of `solve`. The tensors must outlive the function; it has to be called on the stream of
-    `launch.torch_stream`, as recorded launches are.
+    The arguments are those of `solve`. The tensors, those of `system` and `factor` too, must outlive the function. It
+    has to be called on the stream of `launch.torch_stream`, as recorded launches are.
     """
     if factor.explicit or len(rhs) == 0 or not factor.factored:
         return lambda: solve(system, factor, vertex_component, rhs, solution)
     scratch = allocate((factor.places, 4), torch.float64, rhs.device)
-    kept = [as_warp(t, wp.int32) for t in (system.start, system.rows, factor.base, factor.first, factor.order)]
-    kept += [
-        as_warp(factor.pivot.view(-1, 4), wp.vec4d),
-        as_warp(factor.triangle, wp.mat44d),
-        as_warp(factor.pointer, wp.int32),
-        as_warp(factor.column, wp.int32),
-        as_warp(factor.value.view(-1, 4), wp.vec4d),
-        as_warp(rhs, wp.vec3d),
-        as_warp(scratch, wp.vec4d),
-        as_warp(solution, wp.vec3d),
-    ]
+    common = [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32), *substitution(factor)]
+    work = [as_argument(rhs, wp.vec3d), as_argument(scratch, wp.vec4d), as_argument(solution, wp.vec3d)]
     device = wp.device_from_torch(rhs.device)
-    command = wp.launch(substitute, dim=len(factor.base), inputs=kept, device=device, record_cmd=True)
+    command = wp.launch(substitute, dim=len(factor.base), inputs=[*common, *work], device=device, record_cmd=True)
 
-    def launch(kept: list[wp.array] = kept) -> None:  # the launch itself keeps no array alive
+    def launch(kept: torch.Tensor = scratch) -> None:  # the launch itself keeps no memory alive
         command.launch()
 
     return launch

@@ -59,13 +59,12 @@ def bending_kernel(
     rest_angle: wp.array[wp.float64],
     stiffness: wp.array[wp.float64],
     damping: wp.array[wp.float64],
-    first: int,
     # In:
     vertices: wp.array[wp.vec3d],
     angle_before: wp.array[wp.float64],
     # Out:
     energy: wp.array[wp.float64],
-    gradient: wp.array[wp.vec3d],  # of the four vertices of each hinge, from row `first`
+    gradient: wp.array[wp.vec3d],  # of the vertices of the hinges, [4 H]
 ):
     i = wp.tid()
     hinge = hinges[i]
@@ -79,7 +78,7 @@ def bending_kernel(
     square_a = wp.dot(normal_a, normal_a)
     square_b = wp.dot(normal_b, normal_b)
     length = wp.length(edge)
-    row = first + 4 * i
+    row = 4 * i
     if square_a < FLAT or square_b < FLAT or length == wp.float64(0.0):
         energy[i] = wp.float64(0.0)
         for k in range(4):

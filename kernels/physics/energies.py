@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, expect, torch_stream
-from warpgarment.kernels.operator import allocate
+from warpgarment.kernels.launch import expect
+from warpgarment.kernels.operator import allocate, launch
 
 from .bending import bending_kernel
 from .cloth import PhysicsCloth
@@ -60,46 +60,21 @@ def _cloth_energies(vertices: torch.Tensor, model: list[torch.Tensor]) -> tuple[
     """Energies [B] and the gradients of their sums [V,3], of the membrane and of bending."""
     faces, inverse_rest, stiffness, hinges, rest_angle, bend, vertex_start = model
     device, vertices = vertices.device, vertices.contiguous()
-    at = as_argument(vertices, wp.vec3d)
 
     def new(*shape: int) -> torch.Tensor:
         return allocate(shape, torch.float64, device)
 
     energies, gradients = (new(len(faces)), new(len(hinges))), (new(3 * len(faces), 3), new(4 * len(hinges), 3))
-    no_damping, no_strain = new(len(faces)).zero_(), new(len(faces), 3).zero_()
-    no_bend_damping = new(len(hinges)).zero_()
-    with torch_stream(device) as warp_device:
-        if len(faces):
-            wp.launch(
-                membrane_kernel,
-                dim=len(faces),
-                inputs=[
-                    as_argument(faces, wp.vec3i),
-                    as_argument(inverse_rest, wp.mat22d),
-                    as_argument(stiffness, wp.mat33d),
-                    as_argument(no_damping, wp.float64),
-                    at,
-                    as_argument(no_strain, wp.vec3d),
-                ],
-                outputs=[as_argument(energies[0], wp.float64), as_argument(gradients[0], wp.vec3d)],
-                device=warp_device,
-            )
-        if len(hinges):
-            wp.launch(
-                bending_kernel,
-                dim=len(hinges),
-                inputs=[
-                    as_argument(hinges, wp.vec4i),
-                    as_argument(rest_angle, wp.float64),
-                    as_argument(bend, wp.float64),
-                    as_argument(no_bend_damping, wp.float64),
-                    0,
-                    at,
-                    as_argument(rest_angle, wp.float64),
-                ],
-                outputs=[as_argument(energies[1], wp.float64), as_argument(gradients[1], wp.vec3d)],
-                device=warp_device,
-            )
+    still = new(len(faces)).zero_(), new(len(hinges)).zero_()  # no damping
+    strain = new(len(faces), 3).zero_()
+    membrane = [(faces, wp.vec3i), (inverse_rest, wp.mat22d), (stiffness, wp.mat33d), (still[0], wp.float64)]
+    membrane += [(vertices, wp.vec3d), (strain, wp.vec3d)]
+    bending = [(hinges, wp.vec4i), (rest_angle, wp.float64), (bend, wp.float64), (still[1], wp.float64)]
+    bending += [(vertices, wp.vec3d), (rest_angle, wp.float64)]
+    for kernel, inputs, energy, gradient in zip(
+        (membrane_kernel, bending_kernel), (membrane, bending), energies, gradients, strict=True
+    ):
+        launch(kernel, len(energy), inputs, [(energy, wp.float64), (gradient, wp.vec3d)], device)
     sums, sloped = [], []
     for energy, gradient, corners in zip(energies, gradients, (faces, hinges), strict=True):
         group = torch.bucketize(corners[:, 0].contiguous(), vertex_start[1:], right=True)

@@ -49,7 +49,6 @@ class Search:
     newest: wp.array[wp.int32]  # slot of the newest pair
     fresh: wp.array[wp.int32]  # whether the last trial was accepted, so that a new direction is due
     done: wp.array[wp.int32]
-    count: wp.array[wp.int32]  # number of evaluations
     curvature: wp.array2d[wp.float64]
     weight: wp.array2d[wp.float64]  # α of algorithm 7.4
     point: wp.array[wp.vec3d]
@@ -83,7 +82,6 @@ def begin_kernel(
     search.step[b] = wp.float64(0.0)
     search.fresh[b] = 0
     search.done[b] = 0
-    search.count[b] = 0
     if keep == 0:
         search.pairs[b] = 0
 
@@ -175,8 +173,6 @@ def accept_kernel(
         if lane == 0:
             search.fresh[b] = 0
             search.step[b] = wp.float64(0.5) * step
-    if lane == 0 and search.done[b] == 0:
-        search.count[b] = search.count[b] + 1
 
 
 @wp.kernel(enable_backward=False)

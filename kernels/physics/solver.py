@@ -120,7 +120,7 @@ class ImplicitSolver:
         self._corner = empty(3 * faces + 4 * hinges, 3)
         self._energies = empty(faces), empty(hinges), empty(count)
         self._gradient, self._load, self._solved = (empty(count, 3) for _ in range(3))
-        integers = {name: rows(groups, dtype=torch.int32) for name in ("pairs", "newest", "fresh", "done", "count")}
+        integers = {name: rows(groups, dtype=torch.int32) for name in ("pairs", "newest", "fresh", "done")}
         numbers = {name: rows(groups) for name in ("energy", "slope", "step")}
         numbers |= {name: rows(groups, memory) for name in ("curvature", "weight")}
         vectors = {name: rows(count, 3) for name in ("point", "gradient", "direction")}
@@ -166,12 +166,13 @@ class ImplicitSolver:
         hinge = as_warp(cloth.hinges, wp.vec4i)
         energies = [as_warp(t, wp.float64) for t in self._energies]
         corner, gradient = as_warp(self._corner, wp.vec3d), as_warp(self._gradient, wp.vec3d)
+        of_hinges = as_warp(self._corner[3 * faces :], wp.vec3d)
         strain, angle = as_warp(self.strain, wp.vec3d), as_warp(self.angle, wp.float64)
         block = block_dim(self._device, len(cloth.mass), self._groups)
 
         # A recorded launch keeps no array alive.
         self._kept = [held, contact, trial, *integer.values(), *starts, *triangles, hinge, *energies, corner, gradient]
-        self._kept += [strain, angle]
+        self._kept += [strain, angle, of_hinges]
 
         def record(kernel: Any, dim: int, inputs: list[Any], outputs: list[Any]) -> Any:
             return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
@@ -199,9 +200,7 @@ class ImplicitSolver:
             "angle": record(angle_kernel, hinges, [hinge, trial], [angle]),
             "begin": record(begin_kernel, self._groups, [self._search, int(keep_pairs)], []),
             "membrane": record(membrane_kernel, faces, [*triangles, *stiffness, trial, strain], [energies[0], corner]),
-            "bending": record(
-                bending_kernel, hinges, [hinge, *bending, 3 * faces, trial, angle], [energies[1], corner]
-            ),
+            "bending": record(bending_kernel, hinges, [hinge, *bending, trial, angle], [energies[1], of_hinges]),
             "vertices": record(
                 vertex_kernel, len(cloth.mass), [*model, trial, *planes, corner, more], [energies[2], gradient]
             ),
