@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from . import ClothScene, TeacherError
+from . import ClothScene, Moving, TeacherError
 
 
 def check_scenes(scenes: Sequence[ClothScene]) -> None:
@@ -56,6 +56,33 @@ def _check_body(where: str, frames: np.ndarray, faces: np.ndarray) -> None:
         raise TeacherError(
             f"{where}{bad.sum():,} of {len(frames):,} body frames are not finite (first: {bad.argmax()})"
         )
+
+
+def side_by_side(
+    scenes: Sequence[ClothScene],
+    alike: Callable[[ClothScene], Hashable],
+    run: Callable[[list[ClothScene]], Iterator[list[Moving]]],
+) -> Iterator[list[Moving | None]]:
+    """Simulates scenes that can share a run in one, and the runs frame by frame beside each other.
+
+    Args:
+        scenes: The scenes.
+        alike: Function whose results are equal for scenes that can share a run.
+        run: Function that simulates such scenes, until the longest ends.
+
+    Yields:
+        For every frame, that of each scene, or None once a scene has ended.
+    """
+    groups: dict[Hashable, list[int]] = {}
+    for number, scene in enumerate(scenes):
+        groups.setdefault(alike(scene), []).append(number)
+    running = [(members, run([scenes[m] for m in members])) for members in groups.values()]
+    for frame in range(max(map(len, scenes), default=0)):
+        shown: list[Moving | None] = [None] * len(scenes)
+        for members, stream in running:
+            for m, moving in zip(members, next(stream, [None] * len(members)), strict=True):
+                shown[m] = moving if frame < len(scenes[m]) else None
+        yield shown
 
 
 def used_body(scene: ClothScene) -> tuple[np.ndarray, np.ndarray]:

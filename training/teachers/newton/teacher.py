@@ -32,7 +32,7 @@ import warp as wp
 from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.kernels.wind import add_air_forces
 from warpgarment.training.teachers import ClothScene, Moving
-from warpgarment.training.teachers.scenes import check_scenes
+from warpgarment.training.teachers.scenes import check_scenes, side_by_side
 
 from .settings import NewtonSettings, layer_friction
 from .worlds import Worlds
@@ -106,16 +106,11 @@ class NewtonTeacher:
     def simulate_moving(self, scenes: Sequence[ClothScene]) -> Iterator[list[Moving | None]]:
         """As :meth:`simulate_many`, with velocities: those of the last substep, from which the next one starts."""
         check_scenes(scenes)
-        models: dict[tuple[float, int, float], list[int]] = {}
-        for number, scene in enumerate(scenes):
-            models.setdefault((scene.fps, scene.settle, layer_friction(scene, self._settings)), []).append(number)
-        running = [(members, self._run([scenes[m] for m in members])) for members in models.values()]
-        for frame in range(max(map(len, scenes), default=0)):
-            shown: list[Moving | None] = [None] * len(scenes)
-            for members, stream in running:
-                for m, moving in zip(members, next(stream, [None] * len(members)), strict=True):
-                    shown[m] = moving if frame < len(scenes[m]) else None
-            yield shown
+
+        def model(scene: ClothScene) -> tuple[float, int, float]:
+            return scene.fps, scene.settle, layer_friction(scene, self._settings)
+
+        return side_by_side(scenes, model, self._run)
 
     def _run(self, scenes: list[ClothScene]) -> Iterator[list[Moving]]:
         """Frames of scenes that fit one model, until the longest ends."""

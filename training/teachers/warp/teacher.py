@@ -17,7 +17,7 @@ from warpgarment.kernels.launch import as_warp, torch_stream
 from warpgarment.kernels.physics import ImplicitSolver, PhysicsCloth, Sheet
 from warpgarment.kernels.wind import add_air_forces
 from warpgarment.training.teachers import ClothScene, Moving
-from warpgarment.training.teachers.scenes import check_scenes
+from warpgarment.training.teachers.scenes import check_scenes, side_by_side
 
 from .bodies import MovingBodies
 from .meeting import Meeting
@@ -75,16 +75,7 @@ class WarpTeacher:
     def simulate_moving(self, scenes: Sequence[ClothScene]) -> Iterator[list[Moving | None]]:
         """As :meth:`simulate_many`, with velocities: those from which the next step starts."""
         check_scenes(scenes)
-        batches: dict[tuple[float, int], list[int]] = {}
-        for number, scene in enumerate(scenes):
-            batches.setdefault((scene.fps, scene.settle), []).append(number)
-        running = [(members, self._run([scenes[m] for m in members])) for members in batches.values()]
-        for frame in range(max(map(len, scenes), default=0)):
-            shown: list[Moving | None] = [None] * len(scenes)
-            for members, stream in running:
-                for m, moving in zip(members, next(stream, [None] * len(members)), strict=True):
-                    shown[m] = moving if frame < len(scenes[m]) else None
-            yield shown
+        return side_by_side(scenes, lambda scene: (scene.fps, scene.settle), self._run)
 
     def _run(self, scenes: list[ClothScene]) -> Iterator[list[Moving]]:
         """Frames of scenes of equal frame rate and settling time, until the longest ends."""
@@ -116,7 +107,7 @@ class WarpTeacher:
         motion = _Motion(points, options.scheme, step)
         air = _Air(cloth, scene_of_vertex, options, device)
         gravity = torch.tensor(np.stack([s.gravity for s in scenes])[scene_of_vertex], device=device).double()
-        still = torch.from_numpy(held).to(device)
+        still = torch.from_numpy(held).to(device)[:, None]
         coefficient = torch.from_numpy(friction).to(device)
         settle = scenes[0].settle
         for frame in range(settle + max(map(len, scenes))):
@@ -129,7 +120,7 @@ class WarpTeacher:
                 target = motion.target(acceleration)
                 guess = motion.guess()
                 pinned, held_at = bodies.pins(share)
-                target[still], guess[still] = points[still], points[still]
+                target, guess = (torch.where(still, points, wanted) for wanted in (target, guess))
                 target[pinned], guess[pinned] = held_at, held_at
                 if bodies.any:
                     planes = bodies.planes(guess, share, 1.0 / options.substeps)
