@@ -70,7 +70,7 @@ def predict(
     face_splits: int = 1,
     half: bool = False,
     device: torch.device | str = "cpu",
-    physics: int = 0,
+    physics: int | None = None,
     correctors: Sequence[Corrector] = (),
     layers: Sequence[Sequence[int]] = (),
 ) -> Memory:
@@ -83,7 +83,7 @@ def predict(
         face_splits: Number of subsets of faces, as in `Simulator.rollout`.
         half: Whether the network runs in bfloat16, as in `Simulator`.
         device: Device of the simulation; on a CPU, the distances from which weights are made count too.
-        physics: Iterations of the cloth's own physics in a frame.
+        physics: Iterations of the cloth's own physics in a frame; None: as the configuration says.
         correctors: Correctors of the simulation, each of which predicts its own memory.
         layers: Garments of each outfit, as numbers in the batch.
 
@@ -91,6 +91,7 @@ def predict(
         Bytes by purpose. The prediction itself allocates no arrays over pairs of faces.
     """
     cpu = torch.device(device).type == "cpu"
+    relaxes = bool(config.physics if physics is None else physics)
     unique = list({id(garment): garment for garment in garments}.values())
     sizes = Sizes.of(garments, bodies)
     _, vertices, faces, body_vertices, body_faces = sizes
@@ -112,7 +113,7 @@ def predict(
             "factors of the solvers": _factors(unique, cpu),
             "history of features": (1 if cpu else GRAPHED) * 4 * config.history * FEATURES * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
-            "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * bool(physics),
+            "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * relaxes,
             "pairs of layers": PER_MEETING_FACE * sum(len(garments[i].faces) for outfit in layers for i in outfit),
             "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
             peak: passing[peak],
@@ -142,7 +143,7 @@ def check(
     face_splits: int = 1,
     half: bool = False,
     device: torch.device | str = "cpu",
-    physics: int = 0,
+    physics: int | None = None,
     correctors: Sequence[Corrector] = (),
     layers: Sequence[Sequence[int]] = (),
 ) -> None:

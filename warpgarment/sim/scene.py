@@ -109,7 +109,7 @@ class Scene:
             face_splits=face_splits,
             half=half,
             device=device,
-            physics=network.config.physics if physics is None else physics,
+            physics=physics,
             correctors=self.correctors,
             layers=layers,
         )

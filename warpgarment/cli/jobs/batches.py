@@ -18,10 +18,7 @@ from warpgarment.sim.simulator import Simulator
 
 from .entries import Job
 
-ON_CPU, ON_GPU = (
-    8,
-    256,
-)  # garments of a batch: more do not make a CPU faster, and would be lost with a run that is killed
+ON_CPU, ON_GPU = 8, 256  # garments of a batch: more do not make a CPU faster, and are lost if a run is killed
 
 
 class Ready(NamedTuple):
@@ -86,6 +83,7 @@ class Waiting:
             self.simulator.network.config,
             half=self.simulator.half,
             device=device,
+            physics=self.simulator.physics,
             correctors=self.simulator.correctors,
             layers=layers,
         ).total
