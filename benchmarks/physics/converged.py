@@ -1,10 +1,12 @@
 """The Warp teacher beside Newton 10 x 5, frame by frame in turns, and both beside their own most converged runs.
 
-    python -m benchmarks.teachers.converged                      # three garments of jersey, 30 frames: five minutes
-    python -m benchmarks.teachers.converged --material default   # of the default material, which is far stiffer
-    python -m benchmarks.teachers.converged --frames 20 --newton-converged   # and Newton 20 x 20, which is slow
+    python -m benchmarks.physics.converged                      # garments of jersey, 30 frames: eight minutes
+    python -m benchmarks.physics.converged --material default   # of the default material, which is far stiffer
+    python -m benchmarks.physics.converged --iterations 60 --tolerance 1e-5
+    python -m benchmarks.physics.converged --frames 20 --newton-converged   # and Newton 20 x 20, which is slow
 
-For each garment: time of a frame (processor time, least, without the first), mean distance of vertices from the same
+The T-shirt has 5 frames to settle, the last dress 15; the two others start at rest on a body that walks at once. For
+each garment: time of a frame (processor time, least, without the first), mean distance of vertices from the same
 solver's most converged run, and the floor below which that distance means nothing: the distance of the converged run
 from its twin, which starts from positions with 0.1 mm of noise. Deepest vertex in the body, crossing triangle pairs
 and stretch are counted without the kernels that are judged. Results: benchmarks/results/teachers_converged_MATERIAL.md.
@@ -77,23 +79,26 @@ def crossings(scene: ClothScene, frames: np.ndarray) -> float:
     return float(np.mean([len(crossing_pairs(points, faces)) for points in frames[::5]]))
 
 
-def compared(name: str, scene: ClothScene, newton_converged: bool) -> list[list[str]]:
+def compared(name: str, scene: ClothScene, settings: WarpSettings, newton_converged: bool) -> list[list[str]]:
     """Rows of the table for a scene."""
-    newton, ours = NewtonTeacher(NewtonSettings()), WarpTeacher(WarpSettings())
+    newton, ours = NewtonTeacher(NewtonSettings()), WarpTeacher(settings)
     for teacher in (newton, ours):
         next(iter(teacher.simulate(scene)))  # compiles what is not compiled
     (by_newton, by_us), (slow, fast) = in_turns([newton, ours], scene)
     best, twin = (np.stack(list(WarpTeacher(BEST).simulate(s))) for s in (scene, twin_of(scene)))
     faces = sum(len(c.garment.faces) for c in scene.cloths)
     rows = []
-    for label, frames, seconds in (("Newton 10 x 5", by_newton, slow), ("Warp 10 x 15", by_us, fast)):
+    for label, frames, seconds in (
+        ("Newton 10 x 5", by_newton, slow),
+        (f"Warp {settings.substeps} x {settings.iterations}", by_us, fast),
+    ):
         found = figures(scene, frames)
         own, floor = "-", "-"
         if frames is by_us:
             own, floor = f"{distance(frames, best):.3f}", f"{distance(best, twin):.3f}"
         elif newton_converged:
-            settings = NewtonSettings(substeps=20, iterations=20)
-            own = f"{distance(frames, np.stack(list(NewtonTeacher(settings).simulate(scene)))):.3f}"
+            more = NewtonTeacher(NewtonSettings(substeps=20, iterations=20))
+            own = f"{distance(frames, np.stack(list(more.simulate(scene)))):.3f}"
         rows.append(
             [
                 name,
@@ -117,6 +122,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--material", default="jersey", help="a preset, or default")
+    parser.add_argument("--iterations", type=int, default=WarpSettings.iterations)
+    parser.add_argument("--tolerance", type=float, default=WarpSettings.tolerance)
     parser.add_argument("--newton-converged", action="store_true")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
@@ -125,18 +132,20 @@ def main() -> None:
         "T-shirt": replace(scenes(20 + options.frames)["T-shirt"], settle=5),
         "dress, remeshed": world(1100, options.frames, 0),
         "dress, finer": world(1836, options.frames, 0),
+        "dress, settled": scenes(options.frames)["dress"],
     }
     material = Material() if options.material == "default" else Material.preset(options.material)
     for name, scene in made.items():
         made[name] = replace(scene, cloths=tuple(replace(cloth, material=material) for cloth in scene.cloths))
-    rows = [row for name, scene in made.items() for row in compared(name, scene, options.newton_converged)]
+    settings = WarpSettings(iterations=options.iterations, tolerance=options.tolerance)
+    rows = [row for name, scene in made.items() for row in compared(name, scene, settings, options.newton_converged)]
     about = ", ".join(f"{k} {v}" for k, v in machine(torch.device("cpu")).items())
     lines = [
         "# Teachers and convergence",
         "",
         about,
         "",
-        f"`python -m benchmarks.teachers.converged --material {options.material} --frames {options.frames}`",
+        f"`python -m benchmarks.physics.converged --material {options.material} --frames {options.frames}`",
     ]
     lines += ["", *table(list(HEADINGS), rows, text=3)]
     options.out.mkdir(parents=True, exist_ok=True)
