@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from warpgarment.errors import UsageError
 from warpgarment.nn.architecture import architecture, preset
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.training.samples.augmentation import Augmentation
@@ -126,17 +127,24 @@ class TrainConfig:
         values = {name: value for name, value in vars(named).items() if name in defaults}
         for name, text in texts.items():
             if name not in defaults:
-                raise ValueError(f"no network setting {name!r}; there are {', '.join(defaults)}")
+                raise UsageError(f"no network setting {name!r}; there are {', '.join(defaults)}")
             values[name] = _value(name, text, type(defaults[name]))
-        return kind(**values)
+        try:
+            return kind(**values)
+        except ValueError as error:
+            raise UsageError(f"overrides: {error}") from error
 
 
 def _value(name: str, text: str, kind: type) -> Any:
     """Converts the text of an override to the type of its setting."""
     if kind is tuple:
         return tuple(part for part in text.split(",") if part)
-    if kind is not bool:
+    if kind is bool:
+        if text.lower() not in ("true", "false"):
+            raise UsageError(f"{name} must be true or false, got {text!r}")
+        return text.lower() == "true"
+    try:
         return kind(text)
-    if text.lower() not in ("true", "false"):
-        raise ValueError(f"{name} must be true or false, got {text!r}")
-    return text.lower() == "true"
+    except ValueError as error:
+        what = {int: "a whole number", float: "a number"}.get(kind, f"of type {kind.__name__}")
+        raise UsageError(f"{name} must be {what}, got {text!r}. Overrides are NAME=VALUE, with spaces between.") from error

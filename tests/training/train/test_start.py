@@ -14,6 +14,7 @@ import torch
 from support import sequences as synthetic_sequences
 from support.runs import SHAPE, config_for, entries_of, losses_of
 
+from warpgarment.errors import UsageError
 from warpgarment.nn import checkpoint
 from warpgarment.training.samples.pushforward import Pool, PushforwardConfig
 from warpgarment.training.samples.single_step import SampleBuilder
@@ -201,3 +202,19 @@ def test_settings_are_checked(tmp_path):
         train.TrainConfig(data=tmp_path, out=tmp_path)
     with pytest.raises(ValueError, match="save_every"):
         config_for(tmp_path, tmp_path, save_every=0)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (("layers=2,heads=4",), "layers must be a whole number, got '2,heads=4'. Overrides are NAME=VALUE"),
+        (("dropout=many",), "dropout must be a number, got 'many'"),
+        (("residual=perhaps",), "residual must be true or false, got 'perhaps'"),
+        (("heads=-1",), "overrides: .*heads"),
+        (("rounds=3",), "no network setting 'rounds'"),
+    ],
+)
+def test_overrides_that_mean_nothing_are_told_by_name(tmp_path, overrides, says):
+    """A slip in --overrides ends with a fault of the program and a traceback."""
+    with pytest.raises(UsageError, match=says):
+        train.TrainConfig(tmp_path, tmp_path, network="fast", steps=1, overrides=overrides).network_config()
