@@ -57,7 +57,7 @@ class GenerateConfig:
         materials: "fixed" gives all garments the same cloth, "sampled" each its own; None for the recipe's default.
         wind: Whether there is wind, in about half of the sequences; None for the recipe's default.
         velocities: Whether the teacher's velocity of each vertex at the end of each frame is recorded, too, for
-            restarts; only Newton knows them. Sequences take almost twice the space, and are the same otherwise.
+            restarts; not by Blender. Sequences take almost twice the space, and are the same otherwise.
         seed: Seed of the whole set.
         attempts: Largest number of attempts at a sequence, of which the quality gate may reject some.
         least_frames: Number of good frames; a sequence that fails after more of them is kept up to the failure.

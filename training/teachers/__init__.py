@@ -60,12 +60,15 @@ class Cloth:
             None takes the rest mesh.
         edge: Typical edge length [m].
         material: Material of the cloth.
+        velocity: Velocities at the start [m/s], float32 [V, 3]: the scene goes on from there, and its first frame is
+            the start. None: the cloth is at rest, and settles first.
     """
 
     garment: Garment
     edge: float
     start: np.ndarray | None = None
     material: Material = field(default_factory=Material)
+    velocity: np.ndarray | None = None
 
     @property
     def first(self) -> np.ndarray:
@@ -84,7 +87,8 @@ class ClothScene:
         frames: Number of frames T without a body.
         fps: Frames per second.
         wind: Velocity of the air in each frame [m/s], [T, 3]; None for still air.
-        settle: Number of frames simulated in the first pose before the first frame that is returned.
+        settle: Number of frames simulated in the first pose before the first frame that is returned; 0 for a scene that
+            goes on.
         gravity: Acceleration [m/s^2].
     """
 
@@ -99,6 +103,11 @@ class ClothScene:
 
     def __len__(self) -> int:
         return self.frames if self.body_frames is None else len(self.body_frames)
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether its cloths start with given velocities."""
+        return any(cloth.velocity is not None for cloth in self.cloths)
 
     @property
     def starts(self) -> np.ndarray:
@@ -124,7 +133,8 @@ class Teacher(Protocol):
     name: str
 
     def simulate(self, scene: ClothScene) -> Iterator[np.ndarray]:
-        """Yields T frames [m], float32 [V, 3], cloths end to end; the first is the settled drape.
+        """Yields T frames [m], float32 [V, 3], cloths end to end; the first is the settled drape, or the start of a
+        scene that goes on.
 
         A caller may leave the loop early; the teacher then releases its resources.
 

@@ -28,6 +28,14 @@ def check_scenes(scenes: Sequence[ClothScene]) -> None:
                 raise TeacherError(f"{name} starts from shape {list(start.shape)}, its rest mesh is {list(rest.shape)}")
             if not np.isfinite(start).all():
                 raise TeacherError(f"{name}: {(~np.isfinite(start)).any(1).sum():,} start positions are not finite")
+            if cloth.velocity is not None and np.shape(cloth.velocity) != rest.shape:
+                raise TeacherError(
+                    f"{name} has velocities of shape {list(np.shape(cloth.velocity))}, its rest mesh is "
+                    f"{list(rest.shape)}"
+                )
+            if cloth.velocity is not None and not np.isfinite(cloth.velocity).all():
+                wrong = (~np.isfinite(cloth.velocity)).any(1).sum()
+                raise TeacherError(f"{name}: {wrong:,} velocities are not finite")
             if not cloth.edge > 0:
                 raise TeacherError(f"{name}: its edge length must be positive, got {cloth.edge}")
         if (scene.body_frames is None) != (scene.body_faces is None):
@@ -36,6 +44,8 @@ def check_scenes(scenes: Sequence[ClothScene]) -> None:
             raise TeacherError(f"{where}there are no frames; set `frames` where there is no body")
         if scene.fps <= 0 or scene.settle < 0:
             raise TeacherError(f"{where}fps {scene.fps} must be positive and settle {scene.settle} at least 0")
+        if scene.goes_on and (scene.settle or any(cloth.velocity is None for cloth in scene.cloths)):
+            raise TeacherError(f"{where}a scene that goes on needs velocities of all its cloths, and settle 0")
         if scene.body_frames is not None:
             _check_body(where, np.asarray(scene.body_frames), np.asarray(scene.body_faces))
         if scene.wind is not None and np.shape(scene.wind) != (len(scene), 3):
@@ -93,6 +103,16 @@ def used_body(scene: ClothScene) -> tuple[np.ndarray, np.ndarray]:
     used, faces = np.unique(scene.body_faces, return_inverse=True)
     frames = np.ascontiguousarray(np.asarray(scene.body_frames)[:, used], dtype=np.float32)
     return frames, faces.reshape(-1, 3).astype(np.int32)
+
+
+def start_of(scenes: Sequence[ClothScene]) -> list[Moving]:
+    """Positions and velocities from which scenes go on."""
+    found = []
+    for scene in scenes:
+        points = np.concatenate([cloth.first for cloth in scene.cloths]).astype(np.float32)
+        speeds = [np.zeros_like(c.first) if c.velocity is None else c.velocity for c in scene.cloths]
+        found.append(Moving(points, np.concatenate(speeds).astype(np.float32)))
+    return found
 
 
 class MovingFrame:

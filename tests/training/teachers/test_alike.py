@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from support.cloth import BALL, on_ball, sheet, still, stretch
 
 from warpgarment.objects.garment import Garment
-from warpgarment.training.teachers import ClothScene
+from warpgarment.training.teachers import ClothScene, TeacherError
 from warpgarment.training.teachers.newton.settings import NewtonSettings
 from warpgarment.training.teachers.newton.teacher import NewtonTeacher
 from warpgarment.training.teachers.warp.settings import WarpSettings
@@ -78,3 +78,42 @@ def test_pins_keep_their_place_on_a_turning_body(teacher):
     expected = np.einsum("tij,vj->tvi", turns, cloth.garment.vertices[np.sort(pins)]) + shift[:, None]
     # float32 positions of half a metre, heights above a face of up to 10 cm
     np.testing.assert_allclose(frames[:, np.sort(pins)], expected, atol=2e-6)
+
+
+def test_a_scene_goes_on_from_positions_and_velocities(teacher):
+    """A restart begins with the start itself; over the next frames it leaves the whole simulation by less than a tenth
+    of what a restart without velocities does. The body speeds up, so that velocities matter. It cannot be closer: the
+    Warp teacher's solver begins without what it has learned in earlier steps, and friction multiplies the difference
+    of its few iterations."""
+    path = still(10)
+    path[:, 0] = 0.004 * np.arange(10) ** 2
+    scene = on_ball(path, settle=2)
+    whole = [worlds[0] for worlds in teacher[0].simulate_moving([scene])]
+    rest = scene.body_frames[4:]
+
+    def again(velocity: np.ndarray | None) -> np.ndarray:
+        cloth = replace(scene.cloths[0], start=whole[4].vertices, velocity=velocity)
+        return simulated(teacher, replace(scene, cloths=(cloth,), body_frames=rest, settle=0))
+
+    found, slow = again(whole[4].velocities), again(np.zeros_like(whole[4].velocities))
+    expected = np.stack([frame.vertices for frame in whole[4:]])
+    np.testing.assert_array_equal(found[0], whole[4].vertices)
+    off, without = (np.linalg.norm(frames - expected, axis=-1).mean(axis=1)[1:] for frames in (found, slow))
+    assert without.min() > 2e-3
+    assert (off[:3] < 0.1 * without[:3]).all()
+
+
+def test_a_scene_that_cannot_go_on_is_refused(teacher):
+    """Velocities of some cloths would be ignored, or settled away, without a word."""
+    scene = on_ball(still(2), sheet(0.4, 0.17), sheet(0.4, 0.195), settle=0)
+    cloth = scene.cloths[0]
+    going = replace(cloth, velocity=np.zeros_like(cloth.first))
+    wrong = {
+        "velocities of all its cloths": replace(scene, cloths=(going, scene.cloths[1])),
+        "settle 0": replace(scene, cloths=(going, replace(going, start=scene.cloths[1].first)), settle=1),
+        r"shape \[3, 3\]": replace(scene, cloths=(replace(cloth, velocity=np.zeros((3, 3))),)),
+        "121 velocities are not finite": replace(scene, cloths=(replace(going, velocity=going.velocity * np.nan),)),
+    }
+    for says, faulty in wrong.items():
+        with pytest.raises(TeacherError, match=says):
+            list(teacher[0].simulate(faulty))

@@ -77,6 +77,8 @@ class BlenderTeacher:
     def _running(self, scene: ClothScene) -> Iterator[Iterator[np.ndarray]]:
         """Context with the frames of a scene; at its end, Blender is stopped and its files are removed."""
         check_scenes([scene])
+        if scene.goes_on:
+            raise TeacherError("Blender cannot go on from given velocities. Take another teacher.")
         with tempfile.TemporaryDirectory(prefix="warpgarment-blender-") as name:
             folder = Path(name)
             write_scene(folder, scene, self._settings)

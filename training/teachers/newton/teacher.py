@@ -32,7 +32,7 @@ import warp as wp
 from warpgarment.errors import MissingExtra, UsageError
 from warpgarment.kernels.wind import add_air_forces
 from warpgarment.training.teachers import ClothScene, Moving
-from warpgarment.training.teachers.scenes import check_scenes, side_by_side
+from warpgarment.training.teachers.scenes import check_scenes, side_by_side, start_of
 
 from .settings import NewtonSettings, layer_friction
 from .worlds import Worlds
@@ -107,8 +107,8 @@ class NewtonTeacher:
         """As :meth:`simulate_many`, with velocities: those of the last substep, from which the next one starts."""
         check_scenes(scenes)
 
-        def model(scene: ClothScene) -> tuple[float, int, float]:
-            return scene.fps, scene.settle, layer_friction(scene, self._settings)
+        def model(scene: ClothScene) -> tuple[float, int, bool, float]:
+            return scene.fps, scene.settle, scene.goes_on, layer_friction(scene, self._settings)
 
         return side_by_side(scenes, model, self._run)
 
@@ -144,7 +144,12 @@ class NewtonTeacher:
 
         graphs: dict[int, Any] = {}
         aside: set[int] = set()
-        for frame in range(settle + max(map(len, scenes))):
+        begun = 0
+        if scenes[0].goes_on:
+            worlds.begin_frame(0)
+            begun = 1
+            yield start_of(scenes)
+        for frame in range(begun, settle + max(map(len, scenes))):
             worlds.begin_frame(frame)
             for step in range(options.substeps):
                 now.clear_forces()
@@ -160,7 +165,7 @@ class NewtonTeacher:
                         drag=options.drag,
                         lift=options.lift,
                     )
-                if frame == 0 and step == 0:  # compiles the kernels; only loaded kernels can be captured in a graph
+                if frame == begun and step == 0:  # compiles the kernels; only loaded kernels can be captured in a graph
                     advance()
                 else:
                     if id(now) not in graphs:

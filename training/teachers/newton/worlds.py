@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpgarment.training.teachers import ClothScene, Moving
-from warpgarment.training.teachers.scenes import MovingFrame, bound_to_body, used_body
+from warpgarment.training.teachers.scenes import MovingFrame, bound_to_body, start_of, used_body
 
 from .kernels import set_bodies_kernel, set_pins_kernel
 from .settings import _mean_friction, layer_friction
@@ -95,13 +95,13 @@ class Worlds:
         return bool(self._meshes)
 
     def place(self, *states: Any) -> None:
-        """Writes the start positions of the cloths into states of the model."""
-        parts = []
-        for scene, frame in zip(self.scenes, self._frames, strict=True):
-            first = np.concatenate([cloth.first for cloth in scene.cloths])
-            parts.append((first - frame.origin(1.0)).astype(np.float32))
+        """Writes the start of the cloths into states of the model. The moving coordinates are at rest then."""
+        begin = start_of(self.scenes)
+        shifts = [frame.origin(1.0) for frame in self._frames]
+        parts = [(one.vertices - shift).astype(np.float32) for one, shift in zip(begin, shifts, strict=True)]
         for state in states:
             state.particle_q.assign(np.concatenate(parts))
+            state.particle_qd.assign(np.concatenate([one.velocities for one in begin]))
 
     def begin_frame(self, frame: int) -> None:
         """Uploads the motion of bodies, moving coordinates and winds during a frame of the simulation."""

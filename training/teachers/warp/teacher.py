@@ -17,9 +17,9 @@ from warpgarment.kernels.launch import as_warp, torch_stream
 from warpgarment.kernels.physics import ImplicitSolver, PhysicsCloth, Sheet
 from warpgarment.kernels.wind import add_air_forces
 from warpgarment.training.teachers import ClothScene, Moving
-from warpgarment.training.teachers.scenes import check_scenes, side_by_side
+from warpgarment.training.teachers.scenes import check_scenes, side_by_side, start_of
 
-from .bodies import MovingBodies
+from .bodies import MovingBodies, Planes
 from .meeting import Meeting
 from .settings import WarpSettings
 
@@ -75,10 +75,10 @@ class WarpTeacher:
     def simulate_moving(self, scenes: Sequence[ClothScene]) -> Iterator[list[Moving | None]]:
         """As :meth:`simulate_many`, with velocities: those from which the next step starts."""
         check_scenes(scenes)
-        return side_by_side(scenes, lambda scene: (scene.fps, scene.settle), self._run)
+        return side_by_side(scenes, lambda scene: (scene.fps, scene.settle, scene.goes_on), self._run)
 
     def _run(self, scenes: list[ClothScene]) -> Iterator[list[Moving]]:
-        """Frames of scenes of equal frame rate and settling time, until the longest ends."""
+        """Frames of scenes of equal frame rate and settling time that all go on, or do not, until the longest ends."""
         options, device = self._settings, self._device
         starts = np.cumsum([0] + [int(scene.starts[-1]) for scene in scenes])
         step = 1.0 / scenes[0].fps / options.substeps
@@ -109,8 +109,14 @@ class WarpTeacher:
         gravity = torch.tensor(np.stack([s.gravity for s in scenes])[scene_of_vertex], device=device).double()
         still = torch.from_numpy(held).to(device)[:, None]
         coefficient = torch.from_numpy(friction).to(device)
-        settle = scenes[0].settle
-        for frame in range(settle + max(map(len, scenes))):
+        settle, begun = scenes[0].settle, 0
+        if scenes[0].goes_on:
+            moving, begun = start_of(scenes), 1
+            motion.velocity = torch.from_numpy(np.concatenate([one.velocities for one in moving])).to(device).double()
+            if bodies.any:  # the first step takes the pressure from here
+                touch(solver, bodies.planes(points, 1.0, 1.0 / options.substeps))
+            yield moving
+        for frame in range(begun, settle + max(map(len, scenes))):
             bodies.begin_frame(frame)
             for number in range(options.substeps):
                 share = (number + 1) / options.substeps
@@ -125,8 +131,7 @@ class WarpTeacher:
                 if bodies.any:
                     planes = bodies.planes(guess, share, 1.0 / options.substeps)
                     solver.friction.copy_(coefficient * pressed(solver, points))
-                    for name in ("normal", "offset", "distance"):
-                        getattr(solver, name).copy_(getattr(planes, name))
+                    touch(solver, planes)
                     solver.anchor.copy_(points + planes.way)
                 solver.target.copy_(target)
                 solver.positions.copy_(points)
@@ -139,6 +144,12 @@ class WarpTeacher:
             if frame >= settle:
                 at, going = (t.float().cpu().numpy() for t in (motion.points, motion.velocity))
                 yield [Moving(at[a:b], going[a:b]) for a, b in itertools.pairwise(starts)]
+
+
+def touch(solver: ImplicitSolver, planes: Planes) -> None:
+    """Gives the solver planes to keep away from."""
+    for name in ("normal", "offset", "distance"):
+        getattr(solver, name).copy_(getattr(planes, name))
 
 
 def pressed(solver: ImplicitSolver, points: torch.Tensor) -> torch.Tensor:
