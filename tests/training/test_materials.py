@@ -12,7 +12,7 @@ from support.cloth import stretch
 
 from warpgarment.objects.material import Material
 from warpgarment.training.generate.quality import Limits
-from warpgarment.training.materials import DLAYERS, RANGES, from_blender, sampled_material, to_blender
+from warpgarment.training.materials import DLAYERS, RANGES, from_blender, sampled_fabric, sampled_material, to_blender
 from warpgarment.training.teachers import Cloth, ClothScene
 from warpgarment.training.teachers.checks import hanging_sheet
 from warpgarment.training.teachers.newton.teacher import NewtonTeacher
@@ -137,3 +137,21 @@ def test_the_extremes_of_the_ranges_can_be_simulated():
         assert np.quantile(changed, 0.99, axis=1).max() < Limits().stretch / 2  # half of what the gate allows
         assert changed.max() < Limits().largest_stretch / 2
     assert igl.avg_edge_length(sheet.vertices.astype(float), sheet.faces) > 0.03  # as coarse as was said
+
+
+def test_sampled_fabrics_are_near_measured_ones():
+    """A set of "fabrics" would hold cloth that nobody wears, or one fabric only. Within four deviations."""
+    rng = np.random.default_rng(3)
+    drawn = [sampled_fabric(rng) for _ in range(200)]
+    assert drawn[0] == sampled_fabric(np.random.default_rng(3))
+    presets = {name: Material.preset(name) for name in ("cotton", "denim", "jersey", "rib", "ponte")}
+    nearest = []
+    for one in drawn:
+        off = {
+            name: max(abs(np.log(getattr(one, f) / getattr(two, f))) for f in ("density", "stretch", "shear", "bend"))
+            for name, two in presets.items()
+        }
+        nearest.append(min(off, key=off.__getitem__))
+        assert off[nearest[-1]] < 0.8
+        assert 0.2 <= one.friction <= 0.5
+    assert set(nearest) == set(presets)

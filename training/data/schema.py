@@ -74,6 +74,12 @@ def _configuration(value: Any) -> bool:
     return words and seed and isinstance(held_out, list) and all(isinstance(name, str) for name in held_out)
 
 
+def _pieces(value: Any) -> bool:
+    if not isinstance(value, dict) or not all(_whole(1, MOST_FRAMES)(value.get(name)) for name in ("frames", "known")):
+        return False
+    return value["known"] < value["frames"]
+
+
 _TEXT = Kind("a text", lambda v: isinstance(v, str))
 _MAYBE_TEXT = Kind("a text or null", lambda v: v is None or isinstance(v, str))
 _SEED = Kind("a whole number", _whole(-_LARGEST, _LARGEST))
@@ -107,6 +113,7 @@ ATTEMPT: Mapping[str, Kind] = {  # entries of a rejected attempt, which every ma
 }
 SEQUENCE: Mapping[str, Kind] = {
     **ATTEMPT,
+    "pieces": Kind('an object with whole numbers "frames" and "known", of which the latter is less', _pieces),
     "rejected_attempts": Kind("a list of the manifests of attempts", _attempts),
     "checksums": Kind(
         "an object of the names of files in the folder and their SHA-256",

@@ -24,7 +24,7 @@ from warpgarment.training.data.splits import split_of_clips, split_of_number
 from warpgarment.training.garments.outfits import OutfitPattern, sampled_outfit
 from warpgarment.training.garments.pattern import CATEGORIES, sampled_pattern
 from warpgarment.training.garments.seams import Seams, sampled_seams
-from warpgarment.training.materials import sampled_material
+from warpgarment.training.materials import sampled_fabric, sampled_material
 from warpgarment.training.motions.clips import clip_frames, list_clips
 from warpgarment.training.motions.procedural import KINDS
 
@@ -54,7 +54,8 @@ class GenerateConfig:
         procedural_share: Share of procedural motions among the training sequences, if there are clips.
         bodies: "anny" samples Anny's shapes (extra `bodies`); "bundled" uses the one body of this package.
         teacher: Physics solver that simulates the sequences.
-        materials: "fixed" gives all garments the same cloth, "sampled" each its own; None for the recipe's default.
+        materials: "fixed" gives all garments the same cloth, "sampled" each its own, of wide ranges, "fabrics" each
+            one like a measured fabric; None for the recipe's default.
         wind: Whether there is wind, in about half of the sequences; None for the recipe's default.
         velocities: Whether the teacher's velocity of each vertex at the end of each frame is recorded, too, for
             restarts; not by Blender. Sequences take almost twice the space, and are the same otherwise.
@@ -83,7 +84,7 @@ class GenerateConfig:
     procedural_share: float = 0.25
     bodies: Literal["anny", "bundled"] = "anny"
     teacher: Literal["newton", "blender", "warp"] = "newton"
-    materials: Literal["fixed", "sampled"] | None = None
+    materials: Literal["fixed", "sampled", "fabrics"] | None = None
     wind: bool | None = None
     velocities: bool = False
     seed: int = 0
@@ -120,10 +121,11 @@ class GenerateConfig:
         if self.motions is not None and not list_clips(Path(self.motions)):
             raise FileNotFoundError(f"no .bvh or .npz clips in {self.motions}")
 
-    @property
-    def with_materials(self) -> bool:
-        """Whether every garment has a material of its own."""
-        return self.recipe == "layers" if self.materials is None else self.materials == "sampled"
+    def material(self, rng: np.random.Generator) -> Material:
+        """Draws the material of a garment; one that is the same for all draws nothing."""
+        kind = self.materials or ("sampled" if self.recipe == "layers" else "fixed")
+        draw = {"fixed": lambda _: Material(), "sampled": sampled_material, "fabrics": sampled_fabric}[kind]
+        return draw(rng)
 
     @property
     def with_wind(self) -> bool:
@@ -227,7 +229,7 @@ def plan_sequence(config: GenerateConfig, number: int, attempt: int = 0) -> Plan
     if cut is not None:
         seams = sampled_seams(np.random.default_rng([config.seed, 2, cut]), "dress")
     count = len(outfit.layers)
-    materials = tuple(sampled_material(rng) if config.with_materials else Material() for _ in range(count))
+    materials = tuple(config.material(rng) for _ in range(count))
     wind = sampled_wind(rng) if config.with_wind and rng.random() < 0.5 else None
     return Plan(
         number, attempt, config.recipe, split, motion, start, mirror, body, phenotype, outfit, materials, wind, seams,

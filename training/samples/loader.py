@@ -25,14 +25,14 @@ class Plan:
 
     Args:
         sizes: Number of faces of each sequence's garment.
-        counts: Number of samples of each sequence.
+        newest: Newest frames of the samples of each sequence, int [N] each.
         batch_size: Number of samples per batch.
         seed: Seed of the order.
     """
 
-    def __init__(self, sizes: list[int], counts: list[int], batch_size: int, seed: int) -> None:
+    def __init__(self, sizes: list[int], newest: list[np.ndarray], batch_size: int, seed: int) -> None:
         self.sizes, self.batch_size, self.seed = np.asarray(sizes), batch_size, seed
-        self._samples = np.concatenate([np.stack([np.full(n, s), np.arange(n)], 1) for s, n in enumerate(counts)])
+        self._samples = np.concatenate([np.stack([np.full(len(t), s), t], 1) for s, t in enumerate(newest)])
         self.batches = max(len(self._samples) // batch_size, 1)  # per epoch
         self._epoch, self._order = -1, self._samples
 

@@ -32,6 +32,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 from warpgarment.objects.pack import PackedBodies, PackedGarments
+from warpgarment.training.data.pieces import Pieces
 from warpgarment.training.data.sequence import Sequence
 
 from .drawing import displacement, part_of
@@ -53,7 +54,7 @@ class OutfitData:
         device: Device on which samples are built.
 
     Raises:
-        UnusableSequence: The sequence has too few frames, or positions that are not finite.
+        UnusableSequence: The sequence has too few frames, or positions that are not finite, or is in pieces.
     """
 
     def __init__(self, sequence: Sequence, folder: Path, network: NetworkConfig, device: torch.device) -> None:
@@ -65,6 +66,9 @@ class OutfitData:
             frame = int(np.nonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0][0])
             raise UnusableSequence(f"garment positions are not finite from frame {frame}")
         self.vertices = torch.as_tensor(np.array(recorded), device=device)
+        self.pieces = Pieces.of(sequence.name, sequence.manifest, len(recorded))
+        if not self.pieces.whole:
+            raise UnusableSequence("it is in pieces, and networks that predict positions train on recordings")
         self.garments, whole = list(sequence.worn), sequence.garment
         self.faces = torch.as_tensor(np.array(whole.faces, np.int32), device=device)
         vertex_component, _, self.components = components(len(whole.vertices), np.asarray(whole.faces))
@@ -92,8 +96,8 @@ class OutfitData:
 
     @property
     def count(self) -> int:
-        """Number of samples: newest frames 0..T-2."""
-        return len(self.vertices) - 1
+        """Number of samples of one step."""
+        return len(self.pieces.newest(1))
 
 
 @dataclass(frozen=True)
@@ -197,7 +201,7 @@ class OutfitBuilder:
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether all frames after `newest` that have a loss are recorded."""
-        return newest + self.steps < len(self.sequences[sequence].vertices)
+        return self.sequences[sequence].pieces.reaches(newest, self.steps)
 
     @torch.no_grad()
     def build(

@@ -89,7 +89,7 @@ class Pool:
 
         Args:
             simulator: A simulator with the current network.
-            sequences: Training sequences, `SequenceData`.
+            sequences: Training sequences, `SequenceData`; those in pieces are left out.
             config: Settings of the pool.
             rng: Source of the random places, in the same state in all processes.
             group: The processes that share the work.
@@ -126,8 +126,9 @@ class Pool:
     ) -> list[tuple[int, int, int, bool]]:
         """Random starts of rollouts: sequence, newest recorded frame, number of steps, whether the start is cold."""
         places = []
-        for _ in range(config.rollouts):
-            s = int(rng.integers(len(sequences)))
+        recordings = [s for s, data in enumerate(sequences) if data.pieces.whole]
+        for _ in range(config.rollouts if recordings else 0):
+            s = recordings[int(rng.integers(len(recordings)))]
             data = sequences[s]
             cold = bool(rng.random() < config.cold) or data.count <= history
             newest = 0 if cold else int(rng.integers(history - 1, data.count))

@@ -19,6 +19,7 @@ from warpgarment.nn.heading import yaw
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
+from warpgarment.training.data.pieces import Pieces
 from warpgarment.training.data.sequence import Sequence
 from warpgarment.training.data.worn import WornGarment
 
@@ -40,9 +41,11 @@ class SequenceData:
     Attributes:
         material: Fields of its `Material`, float32 [M]; NaN if it has none.
         air: Velocity of the air in each frame [m/s], float32 [T,3].
+        pieces: Where its samples are.
 
     Raises:
-        UnusableSequence: The sequence has too few frames, or positions or interactions that are not finite.
+        UnusableSequence: The sequence has too few frames, or positions or interactions that are not finite; or its
+            pieces have too few known frames.
     """
 
     def __init__(
@@ -90,6 +93,11 @@ class SequenceData:
         self.material = torch.tensor(fields, dtype=torch.float32, device=device)
         wind = np.zeros((len(recorded), 3)) if source.wind is None else source.wind[: len(recorded)]
         self.air = torch.as_tensor(np.array(wind, np.float32), device=device)
+        self.pieces = Pieces.of(sequence.name, sequence.manifest, len(self.vertices))
+        if not self.pieces.whole and self.pieces.known < network.history:
+            raise UnusableSequence(
+                f"its pieces begin with {self.pieces.known} known frames, and the network reads {network.history}"
+            )
 
         velocity = self.interaction[..., INTERACTION.slices["velocity"]]
         hot = torch.nn.functional.one_hot(self.face_component, self.components).to(velocity.dtype)
@@ -130,8 +138,8 @@ class SequenceData:
 
     @property
     def count(self) -> int:
-        """Number of samples: newest frames 0..T-2."""
-        return len(self.vertices) - 1
+        """Number of samples of one step."""
+        return len(self.pieces.newest(1))
 
     def _yaw(self) -> torch.Tensor:
         angles = []

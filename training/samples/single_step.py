@@ -94,7 +94,7 @@ class SampleBuilder:
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether the frame after `newest` is recorded."""
-        return newest < self.sequences[sequence].count
+        return self.sequences[sequence].pieces.reaches(newest, 1)
 
     @torch.no_grad()
     def build(

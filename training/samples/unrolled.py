@@ -94,7 +94,7 @@ class UnrolledBuilder:
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether all K frames after `newest` are recorded."""
-        return newest + self.steps < len(self.sequences[sequence].vertices)
+        return self.sequences[sequence].pieces.reaches(newest, self.steps)
 
     @torch.no_grad()
     def build(

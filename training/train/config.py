@@ -147,4 +147,6 @@ def _value(name: str, text: str, kind: type) -> Any:
         return kind(text)
     except ValueError as error:
         what = {int: "a whole number", float: "a number"}.get(kind, f"of type {kind.__name__}")
-        raise UsageError(f"{name} must be {what}, got {text!r}. Overrides are NAME=VALUE, with spaces between.") from error
+        raise UsageError(
+            f"{name} must be {what}, got {text!r}. Overrides are NAME=VALUE, with spaces between."
+        ) from error

@@ -85,13 +85,14 @@ def _train(config: TrainConfig, group: Group, began: float) -> Path:
         sequences = load_sequences(config, network.config, skipped, group)
         validation = load_validation(config, skipped, network.config.fps) if group.first else []
         builder = make_builder(config, network, sequences)
-        sizes, counts = [len(s.faces) for s in sequences], [s.count - config.unroll.steps + 1 for s in sequences]
-        plan = Plan(sizes, counts, config.batch_size, config.seed)
+        newest = [s.pieces.newest(config.unroll.steps) for s in sequences]
+        plan = Plan([len(s.faces) for s in sequences], newest, config.batch_size, config.seed)
         run = Run(config, network, plan, builder, validation, began, group)
         if group.first:
             _prepare(config)
+            samples = sum(map(len, newest))
             say(
-                f"{len(sequences)} sequences, {sum(counts):,} samples, {plan.batches} batches an epoch, {len(skipped)} "
+                f"{len(sequences)} sequences, {samples:,} samples, {plan.batches} batches an epoch, {len(skipped)} "
                 f"skipped; {network.parameter_count():,} parameters on "
                 + (f"{group.size} devices like " if group.size > 1 else "")
                 + str(group.device)
