@@ -60,6 +60,9 @@ class Import:
     """That of the body, where it is another."""
     clean: bool = False
     """Repair rest meshes that have defects."""
+    unrecorded: bool = False
+    """The animation is a network's own, such as of `simulate`: training takes its garment, body and states, but not
+    its positions as targets (`train --cloth.physics`)."""
 
 
 @dataclass
@@ -91,6 +94,8 @@ def _import(options: Import) -> None:
     if options.out.exists():
         raise FileExistsError(f"{options.out} exists. Remove it, or choose another folder.")
     check_writable(options.out, folder=True)
+    if options.unrecorded and options.split != "train":
+        raise UsageError("--unrecorded: a sequence without a recording is for training only. Leave --split out.")
     kind = detect(options.source)
     names = ("body", "rest", "fps", "unit", "body_unit")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
@@ -98,7 +103,8 @@ def _import(options: Import) -> None:
         if name in given:
             raise UsageError(f"--{name.replace('_', '-')}: a {kind} sample says this itself. Leave the option out.")
     recording = read_recording(options.source, kind, clean=options.clean, **given)
-    print(f"wrote {write_as_sequence(recording, options.out, split=options.split, motion=options.motion)}")
+    extra = {"recorded": False} if options.unrecorded else None
+    print(f"wrote {write_as_sequence(recording, options.out, split=options.split, motion=options.motion, extra=extra)}")
 
 
 def _verify(options: Verify) -> None:

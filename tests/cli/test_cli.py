@@ -140,6 +140,10 @@ def test_an_animation_becomes_part_of_a_data_set(scene, capsys) -> None:
     np.testing.assert_allclose(sequence.garment.vertices, rest.vertices, atol=1e-6)
     assert sequence.manifest["split"] == "test"
     assert sequence.manifest["motion"] == "lift"
+    assert "recorded" not in sequence.manifest
+    assert "training only" in _error(capsys, *common[:3], scene / "own", *common[4:], "--unrecorded", *units)
+    assert cli.main([*map(str, [*common[:3], scene / "own", *common[4:], "--unrecorded"]), *units[:4]]) == 0
+    assert Sequence.load(scene / "own").manifest["recorded"] is False
     capsys.readouterr()
     assert cli.main(["dataset", "verify", str(scene / "set"), "--json", str(scene / "report.json")]) == 0
     assert "1 sequences, 5 frames" in capsys.readouterr().out

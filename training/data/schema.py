@@ -113,6 +113,7 @@ ATTEMPT: Mapping[str, Kind] = {  # entries of a rejected attempt, which every ma
 }
 SEQUENCE: Mapping[str, Kind] = {
     **ATTEMPT,
+    "recorded": Kind("true or false", lambda v: isinstance(v, bool)),
     "pieces": Kind('an object with whole numbers "frames" and "known", of which the latter is less', _pieces),
     "rejected_attempts": Kind("a list of the manifests of attempts", _attempts),
     "checksums": Kind(

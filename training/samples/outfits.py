@@ -69,6 +69,8 @@ class OutfitData:
         self.pieces = Pieces.of(sequence.name, sequence.manifest, len(recorded))
         if not self.pieces.whole:
             raise UnusableSequence("it is in pieces, and networks that predict positions train on recordings")
+        if not sequence.manifest.get("recorded", True):
+            raise UnusableSequence("it has no recording, which networks that predict positions need")
         self.garments, whole = list(sequence.worn), sequence.garment
         self.faces = torch.as_tensor(np.array(whole.faces, np.int32), device=device)
         vertex_component, _, self.components = components(len(whole.vertices), np.asarray(whole.faces))

@@ -42,6 +42,7 @@ class SequenceData:
         material: Fields of its `Material`, float32 [M]; NaN if it has none.
         air: Velocity of the air in each frame [m/s], float32 [T,3].
         pieces: Where its samples are.
+        recorded: Whether its positions are those of a recording or a teacher, and not a network's.
 
     Raises:
         UnusableSequence: The sequence has too few frames, or positions or interactions that are not finite; or its
@@ -93,6 +94,7 @@ class SequenceData:
         self.material = torch.tensor(fields, dtype=torch.float32, device=device)
         wind = np.zeros((len(recorded), 3)) if source.wind is None else source.wind[: len(recorded)]
         self.air = torch.as_tensor(np.array(wind, np.float32), device=device)
+        self.recorded = bool(sequence.manifest.get("recorded", True))
         self.pieces = Pieces.of(sequence.name, sequence.manifest, len(self.vertices))
         if not self.pieces.whole and self.pieces.known < network.history:
             raise UnusableSequence(

@@ -49,6 +49,8 @@ class UnrolledBatch:
     face_weight: torch.Tensor  # [F] weights whose weighted sum is a mean over samples of means over faces
     vertex_weight: torch.Tensor  # [V] the corresponding weights of vertices
     components: torch.Tensor  # scalar, as `single_step.Batch.components`
+    materials: torch.Tensor  # [B,M] fields of the material of each garment, NaN where it is not known
+    counted: torch.Tensor  # bool [B], whether `recorded` is a recording; the weights of others are zero
     ids: list[tuple[str, int]]  # name of the sequence, newest frame
 
     def work(self, config: NetworkConfig) -> tuple[int, int]:
@@ -150,6 +152,7 @@ class UnrolledBuilder:
         features = torch.stack([scene.features.of_interaction(v.contiguous(), unpack(r)) for v, r in known], dim=1)
         means = torch.stack([scene.centroids(v) for v in positions], dim=1)  # [C,H,3]
         turn, joint, mirrored = self._symmetries(streams)
+        counted = torch.tensor([data.recorded for data in mine], device=device)
         return UnrolledBatch(
             scene=scene,
             vertices=positions[-1].contiguous(),
@@ -165,9 +168,11 @@ class UnrolledBuilder:
             turn=turn,
             joint=joint,
             mirrored=mirrored,
-            face_weight=_means(scene.packed.garment_of_face, len(picks)),
-            vertex_weight=_means(scene.packed.garment_of_vertex, len(picks)),
+            face_weight=_means(scene.packed.garment_of_face, counted),
+            vertex_weight=_means(scene.packed.garment_of_vertex, counted),
             components=torch.full((), total * len(picks), device=device),
+            materials=torch.stack([data.material for data in mine]),
+            counted=counted,
             ids=[(data.name, t) for (_, t), data in zip(picks, mine, strict=True)],
         )
 
@@ -184,7 +189,8 @@ class UnrolledBuilder:
         return joint @ world, joint, torch.from_numpy(mirrored).to(self.device)
 
 
-def _means(owner: torch.Tensor, count: int) -> torch.Tensor:
-    """Weights whose weighted sum is the mean over garments of means over the elements of each."""
-    number = torch.bincount(owner.long(), minlength=count)
-    return (1.0 / (count * number))[owner.long()].float()
+def _means(owner: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
+    """Weights whose weighted sum is the mean over garments of means over the elements of each, where they count, and
+    of zeros."""
+    number = torch.bincount(owner.long(), minlength=len(counted))
+    return (counted / (len(counted) * number))[owner.long()].float()

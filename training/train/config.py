@@ -14,6 +14,7 @@ from warpgarment.training.samples.augmentation import Augmentation
 from warpgarment.training.samples.noise import NoiseConfig
 from warpgarment.training.samples.pushforward import PushforwardConfig
 
+from .cloth_losses import ClothLossConfig
 from .losses import LossConfig
 from .position_objective import PositionConfig
 from .unrolled_objective import UnrollConfig
@@ -86,6 +87,7 @@ class TrainConfig:
     augmentation: Augmentation = field(default_factory=Augmentation)
     pushforward: PushforwardConfig = field(default_factory=PushforwardConfig)
     unroll: UnrollConfig = field(default_factory=UnrollConfig)
+    cloth: ClothLossConfig = field(default_factory=ClothLossConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     outfit: PositionConfig = field(default_factory=PositionConfig)
     validate_every: int = 500
@@ -115,6 +117,11 @@ class TrainConfig:
             raise ValueError("networks that predict positions are not compiled: leave out compile")
         if self.unroll.steps > 1 and self.compile:
             raise ValueError("unrolled training is not compiled: leave out compile, or set unroll.steps to 1")
+        if self.cloth.terms and (self.unroll.steps == 1 or architecture(self.network_config().architecture).positions):
+            raise ValueError(
+                f"cloth.{self.cloth.terms[0]} is a loss of unrolled training of networks of faces and patches: set "
+                "unroll.steps to 2 or more"
+            )
         if self.unroll.steps > 1 and self.augmentation.scale:
             raise ValueError("unrolled samples keep their size: set augmentation.scale to 0, or unroll.steps to 1")
 

@@ -171,7 +171,7 @@ class Run:
             objective = PositionObjective(self.network, config.outfit, config.precision)
         else:
             unrolled = config.unroll.steps > 1
-            objective = UnrolledObjective(*settings, config.unroll) if unrolled else Objective(*settings)
+            objective = UnrolledObjective(*settings, config.unroll, config.cloth) if unrolled else Objective(*settings)
         self.objective = objective
         self.names = (*objective.figures, "gradient_norm")
         self.recent = [row for row in self.recent if len(row) == len(self.names)]  # others are of another objective

@@ -17,7 +17,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.training.data.sequence import Sequence, list_sequences, read_manifest
 from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import check_rate
-from warpgarment.training.samples.interactions import cached, default_cache
+from warpgarment.training.samples.interactions import UnusableSequence, cached, default_cache
 from warpgarment.training.samples.outfits import OutfitData
 from warpgarment.training.samples.recorded import SequenceData
 
@@ -59,6 +59,8 @@ def load_sequences(
             if positions:
                 sequences.append(OutfitData(loaded, folder, network, group.device))
                 continue
+            if not loaded.manifest.get("recorded", True) and not config.cloth.physics:
+                raise UnusableSequence("it has no recording; cloth.physics gives a loss to such sequences")
             count = len(loaded.layers)
             sequences += [
                 SequenceData(loaded, folder, cache, network, group.device, number if count > 1 else None)

@@ -12,6 +12,8 @@ and, with its own weight, the distance of the predicted vertices from the record
 
     L = 1/K sum_k [ L_def + lambda_sv L_sv + lambda_vel L_vel + position |V~_{t+k} - V_{t+k}| ]
 
+and the terms of `cloth_losses.py`, if they have weights. A sequence without a recording has only its physics.
+
 Gradients flow through the network at every step; through the state, that is deformation gradients, normals, centroids,
 distances and directions to the body, singular values, velocities, the wind relative to faces and the heading; through
 the replacement of singular values; through the Poisson solve, in Phi and mean; through collision refinement, for fixed
@@ -44,9 +46,11 @@ from warpgarment.nn.rows import PaddedView
 from warpgarment.nn.run import run
 from warpgarment.training.samples.unrolled import UnrolledBatch
 
+from .cloth_losses import ClothLossConfig, ClothLosses, ClothState
 from .losses import LossConfig, weighted
 
 MOST_STEPS = 8  # largest K
+FIGURES = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity", "position_m")
 
 
 @dataclass(frozen=True)
@@ -83,14 +87,24 @@ class UnrolledObjective(nn.Module):
         noise: Standard deviation of Gaussian noise on the normalised inputs; 0: none.
         precision: Precision of the transformer, "float32" or "bfloat16".
         unroll: Settings of unrolled training.
+        cloth: Weights of the terms of `cloth_losses.py`.
+
+    Attributes:
+        figures: Names of the numbers that `forward` gives.
     """
 
-    figures = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity", "position_m")
-
     def __init__(
-        self, network: GarmentNetwork, config: LossConfig, noise: float, precision: str, unroll: UnrollConfig
+        self,
+        network: GarmentNetwork,
+        config: LossConfig,
+        noise: float,
+        precision: str,
+        unroll: UnrollConfig,
+        cloth: ClothLossConfig | None = None,
     ) -> None:
         super().__init__()
+        self.cloth = cloth or ClothLossConfig()
+        self.figures = (*FIGURES, *(f"loss_{name}" for name in self.cloth.terms))
         self.network, self.config, self.noise, self.unroll = network, config, noise, unroll
         self.in_bfloat16 = precision == "bfloat16"
 
@@ -100,17 +114,28 @@ class UnrolledObjective(nn.Module):
         return (batch,)
 
     def forward(self, batch: UnrolledBatch) -> torch.Tensor:
-        """Losses [5]: the total and its three terms, as means over the steps, and the mean distance of predicted from
-        recorded vertices [m]. Without a weight for that distance, the last step is not solved and not in its mean."""
-        found, distances = [], []
+        """The numbers named in `figures`: the total and its three terms, as means over the steps, the mean distance of
+        predicted from recorded vertices [m], and the terms of the cloth. Without a weight for that distance or for the
+        cloth, the last step is not solved and not in its mean."""
+        found, distances, looks = [], [], []
+        fps, before, now = self.network.config.fps, batch.before, batch.vertices
+        cloth = None
+        if self.cloth.terms:
+            cloth = ClothLosses(self.cloth, batch.scene.packed, batch.materials, fps, batch.counted)
         for terms, vertices, recorded in self.steps(batch):
             found.append(terms)
-            if vertices is not None:
-                distances.append(((vertices - recorded).norm(dim=1) * batch.vertex_weight).sum())
+            if vertices is None:
+                continue
+            distances.append(((vertices - recorded).norm(dim=1) * batch.vertex_weight).sum())
+            if cloth is not None:
+                looks.append(cloth(ClothState(vertices, recorded, now, before)))
+            before, now = now, vertices
         terms = torch.stack(found).mean(dim=0)
         position = torch.stack(distances).mean() if distances else terms.new_zeros(())
         total = terms[0] + self.unroll.position * position if self.unroll.position else terms[0]
-        return torch.stack([total, *terms[1:], position if self.unroll.position else position.detach()])
+        seen = torch.stack(looks).mean(dim=0) if looks else terms.new_zeros(0)
+        total = total + sum(getattr(self.cloth, name) * term for name, term in zip(self.cloth.terms, seen, strict=True))
+        return torch.stack([total, *terms[1:], position if self.unroll.position else position.detach(), *seen])
 
     def steps(self, batch: UnrolledBatch) -> Iterator[tuple[torch.Tensor, torch.Tensor | None, torch.Tensor]]:
         """Yields for each step the losses [4] of `losses.Losses`, the predicted vertices [V,3] (None for the last step,
@@ -134,7 +159,7 @@ class UnrolledObjective(nn.Module):
             )
             output, terms = self._network(batch, stacked.flatten(1), history.velocities.flatten(1), outside, target)
             last = k + 1 == len(batch.recorded)
-            if last and not self.unroll.position:
+            if last and not self.unroll.position and not self.cloth.terms:
                 yield terms, None, recorded
                 return
             body = batch.bodies[k + 1]
@@ -200,7 +225,8 @@ class UnrolledObjective(nn.Module):
         assert ran.target is not None  # as one was given
         face_weight = view.faces(batch.face_weight)
         face_weight = face_weight if view.face_mask is None else face_weight * view.face_mask
-        component_weight = (view.share[:, None] / batch.components).expand(rows.velocities.shape[:2])
+        share = view.share[:, None] / batch.components * batch.counted[garment][:, None]
+        component_weight = share.expand(rows.velocities.shape[:2])
         if view.component_mask is not None:
             component_weight = component_weight * view.component_mask
         losses = weighted(ran.normalised, ran.target, self.network, self.config, face_weight, component_weight)

@@ -51,7 +51,9 @@ def network(tmp_path_factory) -> Path:
     """An untrained network, whose rollouts move like skin; history 3."""
     out = tmp_path_factory.mktemp("network")
     data = synthetic.write_set(tmp_path_factory.mktemp("tiny"), train=1, frames=8)
-    config = TrainConfig(data, out, network="small", overrides=(*SHAPE, "history=3"), steps=1, batch_size=1, statistics_batches=1)
+    config = TrainConfig(
+        data, out, network="small", overrides=(*SHAPE, "history=3"), steps=1, batch_size=1, statistics_batches=1
+    )
     train.train(replace(config, validate_sequences=0))
     return out / "network.safetensors"
 
