@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 
 def split_of_number(number: int) -> str:
@@ -21,3 +22,10 @@ def split_of_clips(names: list[str]) -> dict[str, str]:
     groups = sorted({clip_group(n) for n in names})
     held = {g: "test" if i % 6 == 2 else "validation" if i % 12 == 5 else "train" for i, g in enumerate(groups)}
     return {n: held[clip_group(n)] for n in names}
+
+
+def evenly(folders: list[Path], most: int | None) -> list[Path]:
+    """At most a number of the folders, evenly spread over the list; all of them for None."""
+    if most is None or len(folders) <= most:
+        return folders
+    return [folders[(i * len(folders)) // most] for i in range(most)]

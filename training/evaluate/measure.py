@@ -30,13 +30,13 @@ from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.outputs import check_writable
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.tables.options import OptionMissing, TableName, TableOptions
 from warpgarment.training.tables.protocol import (
     FIGURES,
     METHODS,
     STARTS,
     cells,
-    evenly,
     means,
     measure,
     plain,

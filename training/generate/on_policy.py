@@ -27,8 +27,8 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.material import Material
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence, list_sequences, write_sequence
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.rollouts import predict
-from warpgarment.training.tables.protocol import evenly
 from warpgarment.training.teachers import Cloth, ClothScene, Teacher, TeacherError, make_teacher
 
 LOST = 0.3

@@ -8,6 +8,7 @@ from typing import Any
 
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.train.config import TrainConfig
 from warpgarment.training.train.run import NonFiniteLoss
 from warpgarment.training.train.training_set import folders_of
@@ -16,7 +17,7 @@ from warpgarment.view.markdown import escape
 from . import recipe, variants
 from .options import DataLacks, OptionMissing
 from .pictures import bars, sweeps
-from .protocol import evenly, means, measure
+from .protocol import means, measure
 from .report import BASELINES, PROTOCOL, means_table, publish
 from .runs import identity, trained
 from .settings import with_settings

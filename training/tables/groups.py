@@ -11,13 +11,14 @@ from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import read_manifest
 from warpgarment.training.data.set_manifest import read_set_manifest
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.generate.recipes import TRAINING_CUTS
 from warpgarment.training.train.training_set import folders_of
 from warpgarment.view.markdown import escape
 
 from .options import DataLacks, OptionMissing
 from .pictures import Keeper, bars, results_file, rollouts
-from .protocol import evenly, means, measure
+from .protocol import means, measure
 from .report import PROTOCOL, means_table, publish
 
 OTHERS = (

@@ -12,6 +12,7 @@ from warpgarment import demo
 from warpgarment.nn import checkpoint
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.rollouts import predict
 from warpgarment.training.train.training_set import folders_of
 from warpgarment.view import draw
@@ -20,7 +21,7 @@ from warpgarment.view.markdown import escape
 from .long_rollout import STILL, Limits, extended, figures, judged, settled, vertex_areas, walk
 from .options import DataLacks, OptionMissing
 from .pictures import axes_of, save
-from .protocol import STARTS, Known, evenly
+from .protocol import STARTS, Known
 from .report import grid, publish
 
 SEQUENCES = 3  # number of sequences of a data set, unless max_sequences is given

@@ -172,13 +172,6 @@ def cells(values: dict[str, float]) -> list[str]:
     return [form.format(values[key] * scale.get(key, 1.0)) for key, (_, form) in FIGURES.items()]
 
 
-def evenly(folders: list[Path], most: int | None) -> list[Path]:
-    """At most a number of the folders, evenly spread over the list; all of them for None."""
-    if most is None or len(folders) <= most:
-        return folders
-    return [folders[(i * len(folders)) // most] for i in range(most)]
-
-
 def skipped_lines(skipped: dict[str, str]) -> list[str]:
     """The number of skipped sequences and the reasons, as lines of Markdown; empty if none was skipped."""
     if not skipped:

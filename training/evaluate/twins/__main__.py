@@ -24,7 +24,7 @@ import numpy as np
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.outputs import check_writable
 from warpgarment.training.data.sequence import Sequence, list_sequences
-from warpgarment.training.tables.protocol import evenly
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.teachers import ClothScene, Teacher, TeacherError, make_teacher
 
 from .scene import TwinError, check_teacher, noisy, scene_of

@@ -31,9 +31,10 @@ from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.rollouts import check_rate, predict, skinned
 from warpgarment.training.tables.options import DataLacks, OptionMissing
-from warpgarment.training.tables.protocol import STARTS, evenly
+from warpgarment.training.tables.protocol import STARTS
 from warpgarment.training.tables.report import publish
 from warpgarment.training.train.training_set import folders_of, reason_of
 

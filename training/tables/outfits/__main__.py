@@ -22,8 +22,9 @@ import torch
 import tyro
 
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.tables.options import RESULTS, DataLacks, OptionMissing
-from warpgarment.training.tables.protocol import evenly, plain, skipped_lines
+from warpgarment.training.tables.protocol import plain, skipped_lines
 from warpgarment.training.tables.report import machine
 from warpgarment.training.train.training_set import folders_of, reason_of
 from warpgarment.view.markdown import code, escape
