@@ -14,6 +14,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.data.splits import evenly
 from warpgarment.training.rollouts import predict
 from warpgarment.training.train.training_set import folders_of
 from warpgarment.view import draw
@@ -21,7 +22,7 @@ from warpgarment.view import draw
 from .meshing import remesh, surface_distance
 from .options import DataLacks, OptionMissing
 from .pictures import axes_of, results_file, save
-from .protocol import STARTS, Known, evenly
+from .protocol import STARTS, Known
 from .report import grid, publish
 
 NOTE = (
