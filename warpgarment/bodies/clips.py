@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from warpgarment.bodies.rest import RestBody
+from warpgarment.bodies.skeleton import PoseSequence
 from warpgarment.errors import MeshError
-from warpgarment.training.bodies.anny import RestBody
-from warpgarment.training.bodies.skeleton import PoseSequence
 
 from .amass import amass_length, read_amass
 from .bvh import bvh_length, read_bvh
