@@ -10,9 +10,9 @@ import numpy as np
 from gpytoolbox import remesh_botsch
 
 from warpgarment import demo
+from warpgarment.geometry.cutting import without_short_edges
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
-from warpgarment.training.meshes.cutting import without_short_edges
 
 MOST_REMESHED = 100_000  # largest number of faces by remeshing; beyond it each face is cut into four instead
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from warpgarment.nn.layers.config import LayersNetConfig
     from warpgarment.nn.layers.network import LayersNet
     from warpgarment.nn.patches.network import PatchTransformer
-    from warpgarment.objects.body import BodyMotion
+    from warpgarment.objects.body import BodyMotion, read_body
     from warpgarment.objects.fit import fit
     from warpgarment.objects.garment import Garment
     from warpgarment.objects.material import Material
@@ -58,6 +58,7 @@ __all__ = [
     "kernels",
     "memory",
     "metrics",
+    "read_body",
 ]
 
 # Where public names live. They are imported when first used: `warpgarment --help` waits for neither torch nor Warp.
@@ -81,6 +82,7 @@ _HOME = {
     "Verdict": "objects.status",
     "Wind": "objects.wind",
     "fit": "objects.fit",
+    "read_body": "objects.body",
 }
 _MODULES = {
     "checkpoint": "nn.checkpoint",

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from warpgarment.bodies.rest import PHENOTYPES, RestBody
 from warpgarment.io.npz import write_npz
-from warpgarment.training.bodies.anny import PHENOTYPES, RestBody
 from warpgarment.view import markdown
 
 from .shapes import box

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from warpgarment.bodies.clips import clip_frames, read_clip, resampled
 from warpgarment.io.disk.cache import remembered
 from warpgarment.io.npz import write_npz
 from warpgarment.training.data.card_facts import Facts as CardFacts
 from warpgarment.training.data.sequence import Sequence, write_sequence
 from warpgarment.training.data.set_manifest import read_set_manifest, write_set_manifest
 from warpgarment.training.data.verify import verify
-from warpgarment.training.motions.clips import clip_frames, read_clip, resampled
 from warpgarment.training.readers.formats import detect, read_recording
 from warpgarment.training.readers.matlab import read_mat
 from warpgarment.training.readers.pc16 import read_pc16

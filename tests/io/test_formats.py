@@ -18,7 +18,9 @@ from warpgarment.io.data import MeshData, MotionData
 from warpgarment.io.files import FORMATS, format_of, read_mesh, read_motion, suffixes, write_mesh, write_motion
 
 EVERY = [suffix for every in FORMATS for suffix in every]
-MESHES, MOTIONS = suffixes("read_mesh"), suffixes("read_motion")
+BONES = [".bvh"]  # motions that hold no positions: tests/bodies
+MESHES, MOTIONS = suffixes("read_mesh"), [suffix for suffix in suffixes("read_motion") if suffix not in BONES]
+OF_POSITIONS = [suffix for suffix in EVERY if suffix not in BONES]
 ball = trimesh.creation.icosphere(1)
 FACES = np.array(ball.faces)
 REST = (np.array(ball.vertices) / 3 + [0, 1, 0]).astype(np.float32)  # thirds: no round numbers in a text
@@ -68,6 +70,7 @@ def test_an_entry_names_a_format_whose_extra_exists(suffix):
     assert format.extra in (None, *metadata.metadata("warpgarment").get_all("Provides-Extra"))
     assert set(format.only_read) <= {s for every in FORMATS if suffix in every for s in every}
     assert EVERY.count(suffix) == 1
+    assert format.bones == (suffix in BONES)
 
 
 def test_asking_for_formats_imports_no_extra():
@@ -198,7 +201,7 @@ DAMAGE = {  # what makes the counts in a file disagree with what it holds
 }
 
 
-@pytest.mark.parametrize("suffix", EVERY)
+@pytest.mark.parametrize("suffix", OF_POSITIONS)
 def test_counts_that_do_not_fit_are_refused(tmp_path, suffix):
     """A vertex or face more or less than there are would shift everything after it."""
     path = made(tmp_path / f"m{suffix}", motion=True)
@@ -209,7 +212,7 @@ def test_counts_that_do_not_fit_are_refused(tmp_path, suffix):
                 loaded(path, motion)
 
 
-@pytest.mark.parametrize("suffix", EVERY)
+@pytest.mark.parametrize("suffix", OF_POSITIONS)
 def test_positions_that_are_not_finite_are_refused(tmp_path, suffix):
     """NaN would reach the solvers."""
     broken = FRAMES.copy()
@@ -221,7 +224,7 @@ def test_positions_that_are_not_finite_are_refused(tmp_path, suffix):
                 loaded(path, motion)
 
 
-@pytest.mark.parametrize("suffix", EVERY)
+@pytest.mark.parametrize("suffix", OF_POSITIONS)
 def test_files_of_another_kind_are_refused(tmp_path, suffix):
     """Text, noise, nothing, or another format's file under this name would end in another library's error."""
     path = made(tmp_path / f"m{suffix}", motion=True)
@@ -239,7 +242,7 @@ def test_messages_name_the_formats_there_are(tmp_path):
     (tmp_path / "a.xyz").write_text("1 2 3")
     (tmp_path / "bare").write_text("1 2 3")
     for name in ("a.xyz", "bare"):
-        with pytest.raises(wg.MeshError, match=r"\.npz.*\.usdz.*\.pc2, \.mdd or a folder"):
+        with pytest.raises(wg.MeshError, match=r"\.npz.*\.usdz.*\.pc2, \.mdd, \.bvh or a folder"):
             wg.BodyMotion.load(tmp_path / name)
         with pytest.raises(wg.MeshError, match=r"\.obj, \.ply, \.off, \.npz.* or \.usdz\.$"):
             wg.Garment.load(tmp_path / name)
@@ -260,6 +263,7 @@ def test_help_names_no_format_that_is_not_there(verb):
     options = re.split("def run|class Checked", options)[0]
     named = set(re.findall(r"\.[a-z0-9]{3,4}\b(?=[,;:)\s])", options)) - {
         ".body",
+        ".data",
         ".view",
         ".wind",
     }  # modules that are imported

@@ -7,16 +7,16 @@ import struct
 
 import pytest
 
+from warpgarment.bodies.amass import amass_length, read_amass
+from warpgarment.bodies.bvh import bvh_length, read_bvh
+from warpgarment.bodies.clips import list_clips
+from warpgarment.bodies.rest import RestBody
 from warpgarment.errors import CheckpointError, MeshError
 from warpgarment.io.disk.plain import read_plain
 from warpgarment.io.files import FORMATS, read_mesh, read_motion
 from warpgarment.io.pc2 import SIGNATURE
 from warpgarment.nn import checkpoint, shards
-from warpgarment.training.bodies.anny import RestBody
 from warpgarment.training.evaluate.model_card import CardError, read_evaluation, read_log
-from warpgarment.training.motions.amass import amass_length, read_amass
-from warpgarment.training.motions.bvh import bvh_length, read_bvh
-from warpgarment.training.motions.clips import list_clips
 from warpgarment.training.readers.formats import detect
 from warpgarment.training.readers.matlab import read_mat
 from warpgarment.training.readers.pc16 import read_pc16

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import warpgarment as wg
-from warpgarment.training.bodies.anny import RestBody, bundled_body
-from warpgarment.training.bodies.skeleton import PoseSequence, posed
+from warpgarment.bodies.rest import RestBody, bundled_body
+from warpgarment.bodies.skeleton import PoseSequence, posed
 from warpgarment.training.garments.make import make_garment
 from warpgarment.training.garments.pattern import sampled_pattern
 from warpgarment.training.motions.procedural import procedural

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from support import meshes
-from warpgarment.training.bodies.anny import RestBody, bundled_body
+from warpgarment.bodies.rest import RestBody, bundled_body
 
 SMPL_JOINTS = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",

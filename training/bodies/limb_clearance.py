@@ -18,11 +18,11 @@ import numpy as np
 from scipy.ndimage import convolve1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
+from warpgarment.bodies.rest import RestBody
+from warpgarment.bodies.skeleton import PoseSequence, bone_transforms, longest_run
 from warpgarment.geometry.skinning import linear_blend_skinning
 
-from .anny import RestBody
 from .limbs import Contact, contacts, heads
-from .skeleton import PoseSequence, bone_transforms, longest_run
 
 TOLERANCE = 1e-3  # lack of distance that is accepted [m]
 _EASE = 0.27  # half the time over which a turn comes and goes [s]

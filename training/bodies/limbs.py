@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .anny import RestBody
+from warpgarment.bodies.rest import RestBody
 
 SHARE = 0.35  # share of its distance in the rest pose that a vertex must keep: about a third of the opening there
 

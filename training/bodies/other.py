@@ -15,10 +15,10 @@ from typing import Any
 import igl
 import numpy as np
 
+from warpgarment.bodies.anny import TEMPLATE_FACES, smoothed
+from warpgarment.bodies.rest import RestBody
 from warpgarment.errors import MissingExtra
-from warpgarment.training.meshes.cutting import averaging, largest_piece, remeshed
-
-from .anny import TEMPLATE_FACES, RestBody, smoothed
+from warpgarment.geometry.cutting import averaging, largest_piece, remeshed
 
 _CELL = 0.012  # cell of the grids on which surfaces are contoured [m]
 _ROUNDS = 25  # rounds of diffusion of the weights: some 7 cm at edges of 25 mm

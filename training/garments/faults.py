@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import igl
 import numpy as np
 
+from warpgarment.bodies.rest import RestBody
+from warpgarment.geometry.cutting import boundary_loops
 from warpgarment.objects.garment import Garment
-from warpgarment.training.bodies.anny import RestBody
-from warpgarment.training.meshes.cutting import boundary_loops
 
 from .layers import Sheet
 

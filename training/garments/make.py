@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpgarment.objects.garment import Garment
-from warpgarment.training.bodies.anny import RestBody
-from warpgarment.training.meshes.cutting import (
+from warpgarment.bodies.rest import RestBody
+from warpgarment.geometry.cutting import (
     cut_below_zero,
     largest_piece,
     pushed_out,
@@ -20,6 +19,7 @@ from warpgarment.training.meshes.cutting import (
     split_at_zero,
     without_specks,
 )
+from warpgarment.objects.garment import Garment
 
 from .faults import faults
 from .pattern import CATEGORIES, JACKETS, NECKLINES, PINNED_NECKLINES, WITH_BODICE, WITH_TUBE, Pattern, waist

@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass, replace
 import igl
 import numpy as np
 
+from warpgarment.bodies.rest import RestBody
+from warpgarment.geometry.cutting import averaging, remeshed
 from warpgarment.objects.garment import Garment
-from warpgarment.training.bodies.anny import RestBody
-from warpgarment.training.meshes.cutting import averaging, remeshed
 
 from .layers import Sheet
 from .make import make_garment

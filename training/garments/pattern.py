@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from warpgarment.training.bodies.anny import RestBody
+from warpgarment.bodies.rest import RestBody
 
 CATEGORIES = ("tshirt", "top", "trousers", "skirt", "dress", "jumpsuit", "jacket", "hooded_jacket")
 WITH_BODICE = ("tshirt", "top", "dress", "jumpsuit", "jacket", "hooded_jacket")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpgarment.training.bodies.anny import RestBody
+from warpgarment.bodies.rest import RestBody
 
 from .pattern import PINNED_NECKLINES, WITH_BODICE, WITH_LEGS, waist
 from .shell import Shell

@@ -12,8 +12,8 @@ import igl
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from warpgarment.training.bodies.anny import RestBody
-from warpgarment.training.meshes.cutting import averaging
+from warpgarment.bodies.rest import RestBody
+from warpgarment.geometry.cutting import averaging
 
 SPACING = 0.015
 

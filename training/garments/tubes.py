@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from warpgarment.training.meshes.cutting import boundary_loops
+from warpgarment.geometry.cutting import boundary_loops
 
 _RING = 0.02  # height of a ring of faces [m]
 _SLICE = 0.03  # a ring is clear of the body within this height above and below it [m]

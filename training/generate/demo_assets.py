@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgarment.training.bodies.anny import anny_bodies
-from warpgarment.training.bodies.skeleton import arms_abducted, blended_in, facing_forward, posed
+from warpgarment.bodies.anny import anny_bodies
+from warpgarment.bodies.skeleton import arms_abducted, blended_in, facing_forward, posed
 from warpgarment.training.garments.make import make_garment
 from warpgarment.training.garments.pattern import Pattern
 from warpgarment.training.motions.procedural import procedural

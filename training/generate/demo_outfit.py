@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from warpgarment.bodies.rest import bundled_body
 from warpgarment.demo import ASSETS
 from warpgarment.io.npz import read_npz
-from warpgarment.training.bodies.anny import bundled_body
 from warpgarment.training.garments.outfits import make_outfit
 
 from .recipes import GenerateConfig, plan_sequence

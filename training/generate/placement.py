@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgarment.geometry.skinning import linear_blend_skinning
-from warpgarment.objects.garment import Garment
-from warpgarment.training.bodies.anny import RestBody, anny_bodies, bundled_body
-from warpgarment.training.bodies.limb_clearance import resolve_clearance
-from warpgarment.training.bodies.skeleton import (
+from warpgarment.bodies.anny import anny_bodies
+from warpgarment.bodies.clips import jumps, list_clips, read_clip, retarget
+from warpgarment.bodies.rest import RestBody, bundled_body
+from warpgarment.bodies.skeleton import (
     PoseSequence,
     arms_abducted,
     blended_in,
@@ -20,11 +19,13 @@ from warpgarment.training.bodies.skeleton import (
     mirrored,
     posed,
 )
+from warpgarment.geometry.skinning import linear_blend_skinning
+from warpgarment.objects.garment import Garment
+from warpgarment.training.bodies.limb_clearance import resolve_clearance
 from warpgarment.training.data.encoding import stored_body, stored_transforms
 from warpgarment.training.garments.make import make_garment
 from warpgarment.training.garments.outfits import make_outfit
 from warpgarment.training.garments.seams import cut_seams, parted
-from warpgarment.training.motions.clips import jumps, list_clips, read_clip, retarget
 from warpgarment.training.motions.procedural import procedural
 from warpgarment.training.teachers import Cloth
 

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from warpgarment.bodies.clips import clip_frames, list_clips
 from warpgarment.objects.material import Material
 from warpgarment.training.data.schema import MOST_FRAMES, MOST_PLANNED
 from warpgarment.training.data.splits import split_of_clips, split_of_number
@@ -25,7 +26,6 @@ from warpgarment.training.garments.outfits import OutfitPattern, sampled_outfit
 from warpgarment.training.garments.pattern import CATEGORIES, sampled_pattern
 from warpgarment.training.garments.seams import Seams, sampled_seams
 from warpgarment.training.materials import sampled_fabric, sampled_material
-from warpgarment.training.motions.clips import clip_frames, list_clips
 from warpgarment.training.motions.procedural import KINDS
 
 from .wind import Wind, sampled_wind
@@ -250,7 +250,7 @@ def _motion(config: GenerateConfig, split: str, rng: np.random.Generator) -> str
 
 def _body(config: GenerateConfig, split: str, order: int, rng: np.random.Generator) -> tuple[str, dict[str, float]]:
     """Every tenth test sequence is on the mannequin, another on the creature."""
-    from warpgarment.training.bodies.anny import sampled_phenotype
+    from warpgarment.bodies.anny import sampled_phenotype
 
     if config.recipe == "seams":  # one body throughout
         rng = np.random.default_rng([config.seed, 3])

@@ -249,7 +249,7 @@ def generate(config: GenerateConfig) -> Path:
     if config.velocities:
         check_velocities(teacher)
     if config.bodies == "anny":
-        from warpgarment.training.bodies.anny import anny_bodies
+        from warpgarment.bodies.anny import anny_bodies
 
         anny_bodies()  # builds the cache once, before the workers start
     config.out.mkdir(parents=True, exist_ok=True)

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from warpgarment.training.bodies.anny import RestBody
-from warpgarment.training.bodies.skeleton import PoseSequence, about_y, bone_transforms
+from warpgarment.bodies.rest import RestBody
+from warpgarment.bodies.skeleton import PoseSequence, about_y, bone_transforms
 
 KINDS = ("walk", "run", "turn", "jump", "bend", "arms")
 

@@ -48,7 +48,7 @@ def read_recording(path: str | Path, format: str | None = None, **options: Any) 
     if kind == "amass":
         raise MeshError(
             f"{path} is an AMASS motion: it moves a body and has no garment. Read it with "
-            "training.motions.amass.read_amass, or give its folder to `warpgarment generate --motions`."
+            "warpgarment.bodies.amass.read_amass, or give its folder to `warpgarment generate --motions`."
         )
     if kind not in READERS:
         raise MeshError(f"the format {kind!r} is not known; there are {', '.join(READERS)}.")

@@ -77,7 +77,7 @@ class SmplPoses:
         return replace(self, rotations=rotations, trans=turn.apply(self.trans))
 
     def save_amass(self, path: str | Path) -> None:
-        """Writes the motion as an AMASS .npz (Z up), which `training.motions.amass.read_amass` reads.
+        """Writes the motion as an AMASS .npz (Z up), which `warpgarment.bodies.amass.read_amass` reads.
 
         The file has the 22 joints that SMPL and SMPL-H share, and straight fingers. The rest position of the pelvis is
         not known without the model, so translations may be off by a constant.

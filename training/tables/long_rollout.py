@@ -113,8 +113,8 @@ def walk(frames: int, seed: int = 0) -> tuple[BodyMotion, np.ndarray]:
         The part of the body with which garments collide, and the rigid transform [3,4], in metres, that moves a garment
         made for the rest pose to the first frame.
     """
-    from warpgarment.training.bodies.anny import bundled_body
-    from warpgarment.training.bodies.skeleton import arms_abducted, blended_in, facing_forward, posed
+    from warpgarment.bodies.rest import bundled_body
+    from warpgarment.bodies.skeleton import arms_abducted, blended_in, facing_forward, posed
     from warpgarment.training.generate.recipes import BLEND, FPS
     from warpgarment.training.motions.procedural import procedural
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import igl
 import numpy as np
 
+from warpgarment.geometry.cutting import remeshed
 from warpgarment.objects.garment import Garment
-from warpgarment.training.meshes.cutting import remeshed
 
 
 class NotRemeshable(ValueError):

@@ -24,7 +24,8 @@ class Info:
     """Options of `info`."""
 
     file: tyro.conf.Positional[Path]
-    """Garment, body or motion: .obj, .ply, .off, .stl, .glb, .npz, .usd, .abc, .pc2, .mdd, or a folder of .obj."""
+    """Garment, body or motion: .obj, .ply, .off, .stl, .glb, .npz, .usd, .abc, .pc2, .mdd, .bvh, or a folder of
+    .obj."""
     mesh: str | None = None
     """Name of the object, where the file holds several; by default each of them."""
     unit: str | None = None
@@ -33,6 +34,8 @@ class Info:
     """Axis that points up in the file; by default Y, or what the file says."""
     fps: float | None = None
     """Rate of the motion, where the file does not say (.pc2, folders of .obj) or says something else."""
+    shape: str | None = None
+    """The body that a .bvh or AMASS motion moves, as --shape of convert."""
 
 
 def run(options: Info) -> None:
@@ -41,13 +44,13 @@ def run(options: Info) -> None:
     names = holds(path).names if options.mesh is None and path.exists() else ()
     chosen: list[str | None] = list(names[:MOST]) if len(names) > 1 else [options.mesh]
     columns = {}
-    with spoken(mesh="--mesh", unit="--unit", up="--up", fps="--fps"):
+    with spoken(mesh="--mesh", unit="--unit", up="--up", fps="--fps", shape="--shape"):
         for name in chosen:
             told = {"unit": options.unit, "up": options.up, "mesh": name}
-            data = read_motion(path, **told)
+            data = read_motion(path, **told, shape=options.shape)
             vertices, faces = np.asarray(data.vertices), np.asarray(data.faces)
             rate = rate_of(path, data, options.fps)
-            source = source_of(path, **told, fps=options.fps, file_fps=data.fps, frames=len(vertices))
+            source = source_of(path, **told, fps=options.fps, file_fps=data.fps, frames=len(vertices), data=data)
             columns[name or data.name or path.name] = Facts.measured(vertices, faces, rate, source)
     print(facts_table(columns))
     if len(names) > len(chosen):

@@ -12,6 +12,7 @@ import tyro
 
 from warpgarment.errors import UsageError
 from warpgarment.io.disk.outputs import check_space
+from warpgarment.io.files import has_bones
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
@@ -32,7 +33,7 @@ class Shot:
     files: tyro.conf.Positional[Files] = ()
     """First the rest mesh of each garment, innermost first, draped on the body's first frame (or see --fit-rest): .obj,
     .ply, .glb, .usd, .abc, .npz. Last the body's motion: .npz, .usd, .abc, .glb, .pc2 or .mdd with its .obj beside it,
-    a folder of .obj."""
+    a folder of .obj; or the motion of a skeleton, .bvh or .npz of AMASS, which moves --body-shape."""
     out: Output | None = None
     """Where to write: .usd, .abc, .glb, .pc2, .mdd, .npz, or a folder of .obj (no suffix). Polygons, UVs, materials
     and groups of the garment's file stay; glTF has triangles only, and normals are left to whoever shows the result.
@@ -63,11 +64,15 @@ class Shot:
     """Name of the mesh where the garment's file holds several. Once for each garment; of a single file, several."""
     body_mesh: str | None = None
     """Name of the mesh where the body's file holds several."""
+    body_shape: str | None = None
+    """The body that a .bvh or AMASS motion moves: bundled (the default), anny, anny with values from 0 to 1
+    (anny,height=0.7,weight=0.3), or an .npz of SMPL, SMPL-H or SMPL-X."""
     clean: bool = False
     """Join seams (open borders whose vertices are at the same place, within 5 % of the edge length), turn faces that
     disagree, drop broken ones. Written are all vertices of the file, in its order."""
     fit_rest: Path | None = None
-    """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame."""
+    """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame. Of a
+    .bvh or AMASS motion, BODY itself included, this is its body at rest."""
     frames: int | None = None
     """Simulate only the first so many frames."""
     out_fps: float | Literal["body", "network"] = "body"
@@ -200,7 +205,9 @@ def _fitted(garments: list[Garment], shot: Shot, body: Load, where: str) -> list
     from warpgarment.objects.fit import fit
 
     whole = _body(shot.files[-1], shot, body, where, collider=False)
-    rest = _body(shot.fit_rest, shot, body, where, collider=False, mesh=None)
+    bones = has_bones(shot.fit_rest)
+    given = {"shape": shot.body_shape} if bones else {"shape": None, "rest": False}
+    rest = _body(shot.fit_rest, shot, body, where, collider=False, mesh=None, **{"rest": True, **given})
     rest_body, first_body = (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces)
     return [fit(garment, rest_body, first_body) for garment in garments]
 
@@ -208,6 +215,7 @@ def _fitted(garments: list[Garment], shot: Shot, body: Load, where: str) -> list
 def _body(path: Path, shot: Shot, body: Load, where: str, **more: Any) -> BodyMotion:
     """A motion in the body's unit, axis and rate."""
     told = {"unit": shot.body_unit, "up": shot.body_up or shot.up, "fps": shot.body_fps, "mesh": shot.body_mesh}
-    with spoken(where, mesh="--body-mesh", unit="--body-unit", up="--body-up", fps="--body-fps"):
+    told["shape"] = shot.body_shape
+    with spoken(where, mesh="--body-mesh", unit="--body-unit", up="--body-up", fps="--body-fps", shape="--body-shape"):
         found: BodyMotion = body(path, **told | more)
     return found

@@ -39,6 +39,8 @@ class View:
     """Name of the mesh where the body's file holds several."""
     body_fps: float | None = None
     """Rate of the body's motion, likewise."""
+    body_shape: str | None = None
+    """The body that a .bvh or AMASS motion moves, as --shape of convert."""
     start: float | None = None
     """Time of the motions' first frame in seconds, where their files do not say or say something else."""
     body_start: float | None = None
@@ -69,8 +71,13 @@ def run(options: View) -> None:
     garments = [_garment(m, p.stem, options.start) for m, p in zip(loaded, options.motion, strict=True)]
     body = None
     if options.body is not None:
-        with spoken(mesh="--body-mesh", fps="--body-fps"):
-            body = BodyMotion.load(options.body, mesh=options.body_mesh, fps=options.body_fps, collider=False)
+        told: dict[str, Any] = {
+            "mesh": options.body_mesh,
+            "fps": options.body_fps,
+            "shape": options.body_shape,
+        }
+        with spoken(mesh="--body-mesh", fps="--body-fps", shape="--body-shape"):
+            body = BodyMotion.load(options.body, collider=False, **told)
         if options.body_start is not None:
             body.start = options.body_start
     body, garments = _together(body, garments, options)

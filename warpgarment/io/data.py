@@ -48,6 +48,8 @@ class MotionData(NamedTuple):
         seconds: Time of the first frame [s], where the file says that in place of a number, or besides.
         last: When the last frame is reached, in frames after the first, where that is not T - 1.
         surface: As of `MeshData`.
+        metres: Metres in a unit of the file, where reading it has shown that and `Format.holds` does not say.
+        up: Axis that points up in the file, likewise.
     """
 
     vertices: np.ndarray
@@ -61,6 +63,8 @@ class MotionData(NamedTuple):
     seconds: float | None = None
     last: float | None = None
     surface: Surface | None = None
+    metres: float | None = None
+    up: str | None = None
 
     @classmethod
     def of(cls, vertices: np.ndarray, faces: np.ndarray, clock: Any, **more: Any) -> MotionData:
@@ -76,11 +80,15 @@ class ReadOptions(NamedTuple):
         mesh: Name of the mesh to read, where the file holds several; None: the only one.
         unit: Length unit of the file, a key of `UNITS`; None: the one that the file names, otherwise metres.
         up: Axis that points up in the file, "y" or "z"; None: the one that the file names, otherwise Y.
+        shape: The body that a file of bones moves, as `warpgarment.bodies.shapes.shape_of` takes it.
+        rest: Whether that body is wanted at rest, one frame, in place of its motion.
     """
 
     mesh: str | None = None
     unit: str | None = None
     up: str | None = None
+    shape: Any = None
+    rest: bool = False
 
 
 class Holds(NamedTuple):
@@ -119,6 +127,8 @@ class Format(NamedTuple):
         axis: Whether the files say which axis is up, or the format does.
         holds: Lists what a file holds, without reading its positions; None: one object, without a name.
         named: Whether meshes in a file have names; otherwise `ReadOptions.mesh` is refused before reading.
+        bones: Whether the files hold the motion of bones, which move the body of `ReadOptions.shape`.
+        recognised: Whether a file is of this format, by what it holds, where another one has the same suffix.
     """
 
     extra: str | None = None
@@ -130,6 +140,8 @@ class Format(NamedTuple):
     named: bool = False
     axis: bool = False
     holds: Callable[[Path], Holds] | None = None
+    bones: bool = False
+    recognised: Callable[[Path], bool] | None = None
 
 
 def scale_of(unit: str | None) -> float:

@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,8 +30,11 @@ FORMATS: dict[tuple[str, ...], str] = {
     (".usd", ".usda", ".usdc", ".usdz"): "warpgarment.io.usd",
     (".pc2",): "warpgarment.io.pc2",
     (".mdd",): "warpgarment.io.caches.mdd",
+    (".bvh",): "warpgarment.bodies.bvh_file",
     ("",): "warpgarment.io.folder",
 }
+# Modules of formats that have a suffix from above, and are recognised by what a file holds.
+ALIKE: dict[str, str] = {".npz": "warpgarment.bodies.amass_file"}
 CACHES = (".pc2", ".mdd")  # of positions alone, with a mesh of the same name beside them
 ASSUMED = 30.0  # frames a second where nobody says
 BIGGEST, SMALLEST = 10.0, 0.05  # sizes [m] beyond which a garment's unit is probably another
@@ -45,6 +48,13 @@ def format_of(suffix: str) -> Format | None:
     """The format of a lower-case suffix, "" being a folder; None where there is none."""
     module = next((module for suffixes, module in FORMATS.items() if suffix in suffixes), None)
     return None if module is None else importlib.import_module(module).FORMAT
+
+
+def has_bones(path: Path) -> bool:
+    """Whether a file that is there holds the motion of bones alone, which a body of the user's choice follows."""
+    suffix = "" if path.is_dir() else path.suffix.lower()
+    format = _alike(path, suffix) or format_of(suffix)
+    return format is not None and format.bones
 
 
 def suffixes(ability: Ability) -> list[str]:
@@ -96,7 +106,15 @@ def read_mesh(
     return data
 
 
-def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None, up: str | None = None) -> MotionData:
+def read_motion(
+    path: Path,
+    *,
+    unit: str | None = None,
+    mesh: str | None = None,
+    up: str | None = None,
+    shape: Any = None,
+    rest: bool = False,
+) -> MotionData:
     """Reads a moving mesh as `BodyMotion.load` describes; the arrays are not checked beyond the format.
 
     Args:
@@ -104,13 +122,18 @@ def read_motion(path: Path, *, unit: str | None = None, mesh: str | None = None,
         unit: See `BodyMotion.load`.
         mesh: See `BodyMotion.load`.
         up: See `BodyMotion.load`.
+        shape: See `BodyMotion.load`.
+        rest: See `BodyMotion.load`.
 
     Raises:
+        UsageError: A shape for a file that has a body, or a body that is not known.
         MeshError: Not a file of its kind, cut short, arrays that do not fit each other, or a suffix that is not known.
         FileNotFoundError: There is no such file.
     """
-    path, scale, options = Path(path), scale_of(unit), ReadOptions(mesh, unit, _axis(up))
+    path, scale, options = Path(path), scale_of(unit), ReadOptions(mesh, unit, _axis(up), shape, rest)
     format = _reader(path, "read_motion", options)
+    if shape is not None and not format.bones:
+        raise UsageError(f"{path} has a body of its own. shape= is for motions of bones alone: BVH and AMASS.")
     if format.read_motion is not None:
         data = format.read_motion(path, options)
     else:
@@ -221,13 +244,22 @@ def _reader(path: Path, ability: Literal["read_mesh", "read_motion"], options: R
         check_plain(path)
     suffix, able = "" if path.is_dir() else path.suffix.lower(), suffixes(ability)
     if suffix in able and (suffix or path.is_dir()):
-        format = format_of(suffix)
+        format = _alike(path, suffix) if ability == "read_motion" else None
+        format = format or format_of(suffix)
         assert format is not None
         if not format.named:
             unnamed(path, options.mesh)
         return format
     kind = "a folder" if path.is_dir() else suffix or "files without a suffix"
     raise MeshError(f"{path}: cannot read {kind}{' as a mesh' if ability == 'read_mesh' else ''}; use {listed(able)}.")
+
+
+def _alike(path: Path, suffix: str) -> Format | None:
+    """The format of `ALIKE` that a file is of; None where it is of the format of its suffix."""
+    if suffix not in ALIKE:
+        return None
+    format: Format = importlib.import_module(ALIKE[suffix]).FORMAT
+    return format if format.recognised and format.recognised(path) else None
 
 
 def _writer(path: Path, ability: Literal["write_mesh", "write_motion"], folder: bool = False) -> Format:

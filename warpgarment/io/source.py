@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 from warpgarment.errors import MeshError
 
-from .data import UNITS, Holds
+from .data import UNITS, Holds, MotionData
 from .files import format_of
 
-GIVEN, FILE, ASSUMED = "given", "from the file", "assumed"
+GIVEN, FILE, ASSUMED, FITTED = "given", "from the file", "assumed", "by the legs"
 
 
 class Source(NamedTuple):
-    """How a file was read. Where something comes from is one of "given", "from the file" and "assumed".
+    """How a file was read. Where something comes from is "given", "from the file", "assumed" or, of BVH, "by the legs".
 
     Attributes:
         path: The file or folder.
@@ -63,6 +63,7 @@ def source_of(
     fps: float | None = None,
     file_fps: float | None = None,
     frames: int = 1,
+    data: MotionData | None = None,
 ) -> Source:
     """How a file was read, from what the user said and what the file says.
 
@@ -74,8 +75,11 @@ def source_of(
         fps: Rate that was given.
         file_fps: Rate that the file has.
         frames: Number of frames that were read.
+        data: What was read.
     """
-    found = holds(path)
+    found, origin = holds(path), FILE
+    if data is not None and (data.metres, data.up) != (None, None):
+        found, origin = found._replace(metres=data.metres, up=data.up), FILE if data.metres == 1.0 else FITTED
     metres = UNITS[unit] if unit else found.metres
     axis = up or found.up
     rate = GIVEN if fps is not None else FILE if file_fps is not None else ASSUMED
@@ -84,7 +88,7 @@ def source_of(
         mesh,
         found.names,
         1.0 if metres is None else metres,
-        GIVEN if unit else ASSUMED if metres is None else FILE,
+        GIVEN if unit else ASSUMED if metres is None else origin,
         axis or "y",
         GIVEN if up else FILE if axis else ASSUMED,
         rate if frames > 1 else "",

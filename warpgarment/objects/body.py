@@ -119,6 +119,8 @@ class BodyMotion:
         collider: bool = True,
         mesh: str | None = None,
         up: str | None = None,
+        shape: Any = None,
+        rest: bool = False,
     ) -> BodyMotion:
         """Reads a motion, with the time of its first frame where the file has it.
 
@@ -128,6 +130,7 @@ class BodyMotion:
         - ``.abc``: a mesh of an Alembic archive (extra ``alembic``);
         - ``.pc2`` or ``.mdd`` with a mesh of the same name beside it (``.obj``, else ``.ply``); MDD says its times;
         - ``.usd``, ``.usda``, ``.usdc``, ``.usdz``: a mesh with time samples;
+        - ``.bvh``, or ``.npz`` of AMASS: the motion of a skeleton, which moves the body `shape`;
         - a folder of ``.obj`` files with the same faces, at the numbers in their names;
         - any mesh file that `Garment.load` reads, as a single frame.
 
@@ -142,17 +145,23 @@ class BodyMotion:
             mesh: Name of the mesh to read where a file holds several: a prim of USD, an object or group of OBJ, a node
                 or mesh of glTF. "*" reads everything in OBJ and glTF as one.
             up: Axis that points up in the file, "y" or "z". None is Y, except that USD files say it themselves.
+            shape: The body on a skeleton: "bundled" (None), which is in the package; "anny", or with its values
+                "anny,height=0.7,weight=0.3" (extra ``bodies``); an .npz of SMPL, SMPL-H or SMPL-X; or a `RestBody`. Its
+                feet stand at height 0, except that models of SMPL's family take AMASS as it is. See docs/bodies.md.
+            rest: Read that body at rest, as garments are modelled on it; other files are read as ever.
 
         Raises:
             MeshError: The file is not of its kind or truncated, its arrays do not fit each other, or the constructor
                 refuses them.
             FileNotFoundError: There is no such file.
+            UsageError: The body is not known, or the file has one of its own.
+            MissingExtra: A package that the format or the body needs is not installed.
         """
         from warpgarment.io.files import rate_of, read_motion, start_of
         from warpgarment.io.source import source_of
 
         path = Path(path)
-        data = read_motion(path, unit=unit, mesh=mesh, up=up)
+        data = read_motion(path, unit=unit, mesh=mesh, up=up, shape=shape, rest=rest)
         rate = rate_of(path, data, fps)
         try:
             motion = cls(data.vertices, data.faces, rate, start=start_of(data, rate), last=data.last)
@@ -162,7 +171,7 @@ class BodyMotion:
             if collider and data.collider_faces is not None:
                 motion = motion.submesh(data.collider_faces)
             motion.source = source_of(
-                path, unit=unit, mesh=mesh, up=up, fps=fps, file_fps=data.fps, frames=motion.frames
+                path, unit=unit, mesh=mesh, up=up, fps=fps, file_fps=data.fps, frames=motion.frames, data=data
             )
             return motion
         except MeshError as error:
@@ -226,3 +235,19 @@ class BodyMotion:
         vertices = self.vertices[:, used]
         flat = repeated_vertices(faces) | no_area(vertices[0], faces)
         return self._derived(vertices, faces, self.clock, int(np.count_nonzero(flat)), None)
+
+
+def read_body(path: str | os.PathLike, shape: Any = None, **options: Any) -> BodyMotion:
+    """Reads the motion of a body: `BodyMotion.load` with the body on a skeleton as second argument.
+
+    ``wg.read_body("walk.bvh", "anny,height=0.7")``
+
+    Args:
+        path: File or folder.
+        shape: The body that a BVH or AMASS file moves, see `BodyMotion.load`.
+        options: Further arguments of `BodyMotion.load`.
+
+    Raises:
+        MeshError, UsageError, MissingExtra, FileNotFoundError: As of `BodyMotion.load`.
+    """
+    return BodyMotion.load(path, shape=shape, **options)

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.bodies import rest_body
 
-from warpgarment.training.bodies import skeleton
+from warpgarment.bodies import skeleton
 from warpgarment.training.bodies.limb_clearance import resolve_clearance
 from warpgarment.training.motions.procedural import procedural
 

@@ -10,10 +10,11 @@ import pytest
 import trimesh
 from support.bodies import rest_body
 
+from warpgarment.bodies import skeleton
+from warpgarment.bodies.anny import sampled_phenotype
+from warpgarment.bodies.rest import PHENOTYPES, RestBody, bundled_body
 from warpgarment.errors import MissingExtra
 from warpgarment.training.bodies import other as other_bodies
-from warpgarment.training.bodies import skeleton
-from warpgarment.training.bodies.anny import PHENOTYPES, RestBody, bundled_body, sampled_phenotype
 from warpgarment.training.bodies.limb_clearance import resolve_clearance
 from warpgarment.training.garments.make import make_garment
 from warpgarment.training.garments.pattern import Pattern

@@ -11,11 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 from support.bodies import rest_body
 
-from warpgarment.objects.garment import Garment
-from warpgarment.training.garments.faults import faults
-from warpgarment.training.garments.make import make_garment
-from warpgarment.training.garments.pattern import CATEGORIES, Pattern, needs_forearms, sampled_pattern
-from warpgarment.training.meshes.cutting import (
+from warpgarment.geometry.cutting import (
     boundary_loops,
     cut_below_zero,
     evened_boundary,
@@ -25,6 +21,10 @@ from warpgarment.training.meshes.cutting import (
     without_short_edges,
     without_specks,
 )
+from warpgarment.objects.garment import Garment
+from warpgarment.training.garments.faults import faults
+from warpgarment.training.garments.make import make_garment
+from warpgarment.training.garments.pattern import CATEGORIES, Pattern, needs_forearms, sampled_pattern
 
 FACES = 600
 GAP = 0.011

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from support.bodies import rest_body
 
+from warpgarment.geometry.cutting import boundary_loops
 from warpgarment.objects.garment import Garment
 from warpgarment.training.garments.make import make_garment
 from warpgarment.training.garments.pattern import CATEGORIES, Pattern
 from warpgarment.training.garments.seams import Seam, Seams, cut_seams, parted, sampled_seams
-from warpgarment.training.meshes.cutting import boundary_loops
 
 ROWS, COLUMNS, RADIUS, HEIGHT = 20, 40, 0.3, 1.0
 

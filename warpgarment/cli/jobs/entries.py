@@ -235,6 +235,7 @@ _KEYS: dict[str, Callable[[str, Any], Any]] = {
     "body_fps": _positive,
     "garment_mesh": _texts,
     "body_mesh": _text,
+    "body_shape": _text,
     "clean": _flag,
     "fit_rest": _text,
     "frames": _count,
@@ -250,6 +251,8 @@ def _of_shot(values: dict[str, Any], folder: Path, beside: Shot) -> dict[str, An
     for name in _PATHS:
         if name in found:
             found[name] = folder / found[name]
+    if str(found.get("body_shape", "")).endswith(".npz"):
+        found["body_shape"] = os.fspath(folder / found["body_shape"])
     if "wind" in found and "wind_file" not in found:
         found |= {"wind_file": None, "wind_fps": None}  # in place of those beside the list
     if "wind_file" in found and "wind" not in found:
@@ -289,7 +292,7 @@ def _pins(value: Any, files: int, meshes: int) -> list[Any]:
 
 def _check_inputs(shot: Shot) -> None:
     """Refuses files that are not there, or of no format that is read."""
-    for file in (*shot.files, shot.fit_rest, shot.wind_file):
+    for file in (*shot.files, shot.fit_rest, shot.wind_file, shape_file(shot)):
         if file is not None and not file.exists():
             raise FileNotFoundError(f"no such file: {file}.")
     last = (shot.files[-1], *([] if shot.fit_rest is None else [shot.fit_rest]))
@@ -297,6 +300,12 @@ def _check_inputs(shot: Shot) -> None:
         for file in files:
             if ("" if file.is_dir() else file.suffix.lower() or ".") not in able:
                 raise UsageError(f"{file}: cannot read {file.suffix or 'this'}; use {listed(able)}.")
+
+
+def shape_file(shot: Shot) -> Path | None:
+    """The file of the body that a skeleton moves; None where it is no file."""
+    name = shot.body_shape or ""
+    return Path(name) if name.endswith(".npz") else None
 
 
 def _meeting(jobs: Sequence[Job]) -> list[Fault]:

@@ -19,7 +19,7 @@ from warpgarment.errors import MeshError, UsageError
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.plain import open_plain, read_plain
 
-from .entries import Job, written_by
+from .entries import Job, shape_file, written_by
 
 LARGEST = 1 << 30  # bytes of a record
 _PIECE = 1 << 20
@@ -77,7 +77,7 @@ def fingerprint(job: Job, network: str, digests: Digests) -> str:
     """
     shot = job.known.shot
     inputs = [digests.of(file) for file in shot.files]
-    more = [digests.of(file) for file in (shot.fit_rest, shot.wind_file) if file is not None]
+    more = [digests.of(file) for file in (shot.fit_rest, shot.wind_file, shape_file(shot)) if file is not None]
     materials = [None if material is None else material.as_dict() for material in job.known.materials]
     told = {name: value for name, value in job.told.items() if name not in ("name", "material")}
     held = [told, materials, inputs, more, network, warpgarment.__version__]

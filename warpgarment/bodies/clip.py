@@ -20,6 +20,7 @@ class Clip:
         rotations: World rotation of each joint, shape [T, J, 3, 3].
         root: Position of the root in the file's unit of length, shape [T, 3].
         fps: Frames per second.
+        up: Axis that points up in the file, "y" or "z".
     """
 
     names: tuple[str, ...]
@@ -27,6 +28,7 @@ class Clip:
     rotations: np.ndarray
     root: np.ndarray
     fps: float
+    up: str = "y"
 
     def __len__(self) -> int:
         return len(self.root)

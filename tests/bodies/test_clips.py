@@ -1,4 +1,4 @@
-"""Motion clips, procedural motions and skeletons."""
+"""Motion clips: BVH and AMASS, in time, and on another body."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.bodies import rest_body, write_amass, write_bvh
 
+from warpgarment.bodies import skeleton
+from warpgarment.bodies.amass import read_amass
+from warpgarment.bodies.bvh import read_bvh
+from warpgarment.bodies.clip import Clip, resampled
+from warpgarment.bodies.clips import clip_frames, jumps, list_clips, read_clip, retarget
 from warpgarment.errors import MeshError
-from warpgarment.geometry.skinning import linear_blend_skinning
-from warpgarment.training.bodies import skeleton
-from warpgarment.training.motions.amass import read_amass
-from warpgarment.training.motions.bvh import read_bvh
-from warpgarment.training.motions.clip import Clip, resampled
-from warpgarment.training.motions.clips import clip_frames, jumps, list_clips, read_clip, retarget
-from warpgarment.training.motions.procedural import KINDS, procedural
+from warpgarment.training.motions.procedural import procedural
 
 ARM = [("Hips", None, (0.0, 0.0, 0.0)), ("Spine", "Hips", (0.0, 2.0, 0.0)), ("Head", "Spine", (0.0, 3.0, 0.0))]
 
@@ -107,64 +106,6 @@ def test_a_clip_with_foreign_joint_names_says_so(tmp_path):
     clip = read_bvh(write_bvh(tmp_path / "f.bvh", ARM, [[0.0] * 12] * 2))
     with pytest.raises(MeshError, match="8 bones have no joint in the clip"):
         retarget(clip, rest_body())
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_procedural_motions_are_rotations_and_smooth(kind):
-    """If this fails, a formula tears the body: no rotation matrices, or jumps between frames."""
-    body = rest_body()
-    poses = procedural(body, kind, 90, seed=3)
-    identity = poses.rotations @ poses.rotations.transpose(0, 1, 3, 2)
-    np.testing.assert_allclose(identity, np.broadcast_to(np.eye(3), identity.shape), atol=1e-9)
-    step = Rotation.from_matrix((poses.rotations[1:] @ poses.rotations[:-1].transpose(0, 1, 3, 2)).reshape(-1, 3, 3))
-    assert np.degrees(step.magnitude()).max() < 35.0  # a run's shin swings at about 900 degrees a second
-    assert np.abs(np.diff(poses.root, axis=0)).max() < 0.2
-    again = procedural(body, kind, 90, seed=3)
-    np.testing.assert_array_equal(poses.rotations, again.rotations)
-
-
-def test_rest_pose_leaves_the_body_as_it_is():
-    """If this fails, bone transforms move a body that should stand in its rest pose."""
-    body = rest_body()
-    rest = skeleton.PoseSequence(np.tile(np.eye(3), (2, len(body.bone_names), 1, 1)), np.tile(body.joints[0], (2, 1)))
-    transforms = skeleton.bone_transforms(body, rest)
-    posed = linear_blend_skinning(body.vertices, body.bone_indices, body.bone_weights, transforms)
-    np.testing.assert_allclose(posed[1], body.vertices, atol=2e-6)  # float32
-
-
-def test_blending_in_starts_at_rest_and_ends_at_the_motion():
-    """If this fails, garments made on the rest pose do not fit the first frame, or the motion jumps after the blend."""
-    body = rest_body()
-    motion = procedural(body, "walk", 40, seed=1)[20:]
-    blended = skeleton.blended_in(body, skeleton.facing_forward(motion), 30)
-    np.testing.assert_allclose(blended.rotations[0], np.broadcast_to(np.eye(3), blended.rotations[0].shape), atol=1e-9)
-    gap = np.abs(blended.rotations[30] - blended.rotations[29]).max()
-    usual = np.abs(np.diff(blended.rotations[5:25], axis=0)).max()
-    assert gap <= usual
-    assert len(blended) == 50
-
-
-def test_mirroring_twice_is_nothing_and_once_swaps_sides():
-    """If this fails, mirrored motions are not mirror images."""
-    body = rest_body()
-    poses = procedural(body, "walk", 30, seed=5)
-    once = skeleton.mirrored(body, poses)
-    np.testing.assert_allclose(skeleton.mirrored(body, once).rotations, poses.rotations, atol=1e-12)
-    left, right = body.bone("LeftLeg"), body.bone("RightLeg")
-    flip = np.diag([-1.0, 1.0, 1.0])
-    np.testing.assert_allclose(once.rotations[:, left], flip @ poses.rotations[:, right] @ flip, atol=1e-12)
-
-
-def test_abducted_arms_move_away_from_the_torso():
-    """If this fails, arms are pressed into the torso instead of lifted off it."""
-    body = rest_body()
-    poses = procedural(body, "bend", 5, seed=0)
-    before, after = (skeleton.bone_transforms(body, p) for p in (poses, skeleton.arms_abducted(body, poses, 15.0)))
-    for side, sign in (("Left", 1.0), ("Right", -1.0)):
-        hand = body.bone(f"{side}Hand")
-        place = body.joints[hand]
-        x = [sign * (t[0, hand, :, :3] @ place + t[0, hand, :, 3])[0] for t in (before, after)]
-        assert x[1] > x[0] + 0.05
 
 
 def test_resampling_a_constant_rotation_is_exact():
@@ -297,44 +238,3 @@ def test_frames_to_which_nobody_moves_are_named():
     root = poses.root + np.where(np.arange(40)[:, None] >= 20, [0.0, 0.0, 1.0], 0.0)
     named = jumps(body, skeleton.PoseSequence(broken, root))
     np.testing.assert_array_equal(np.flatnonzero(named), [10, 11, 20])
-
-
-def test_joints_of_the_mirrored_motion_are_mirror_images():
-    """If this fails, mirrored motions are not what a mirror shows. Twin: the joints' positions, reflected."""
-    body = rest_body()
-    poses = skeleton.arms_abducted(body, procedural(body, "turn", 40, seed=5), 10.0)
-
-    def joints(of: skeleton.PoseSequence) -> np.ndarray:
-        transforms = skeleton.bone_transforms(body, of).astype(np.float64)
-        return np.einsum("tbij,bj->tbi", transforms[..., :3], body.joints) + transforms[..., 3]
-
-    swap = {"Left": "Right", "Right": "Left", "LHip": "RHip", "RHip": "LHip", "LThumb": "RThumb", "RThumb": "LThumb"}
-    twins = [
-        next((swap[s] + name[len(s) :] for s in swap if name.startswith(s)), name) for name in body.bone_names
-    ]  # fmt: skip
-    expected = joints(poses)[:, [body.bone(name) for name in twins]] * np.array([-1.0, 1.0, 1.0])
-    np.testing.assert_allclose(joints(skeleton.mirrored(body, poses)), expected, atol=1e-3)  # the rest pose is, to this
-
-
-def test_halfway_through_the_blend_joints_are_half_turned():
-    """If this fails, the transition from the rest pose is not the shortest one. Twin: half of each joint's angle."""
-    body = rest_body()
-    motion = skeleton.facing_forward(procedural(body, "jump", 60, seed=2)[40:])
-    blended = skeleton.blended_in(body, motion, 20)
-    for name in ("LeftArm", "RightForeArm", "LeftUpLeg", "RightLeg", "Spine1"):
-        bone, parent = body.bone(name), body.bone_parents[body.bone(name)]
-        half, full = (blended.rotations[k, parent].T @ blended.rotations[k, bone] for k in (10, 20))
-        np.testing.assert_allclose(half @ half, full, atol=1e-9)
-    np.testing.assert_allclose(blended.root[10, 1], 0.5 * (body.joints[0, 1] + motion.root[0, 1]))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_procedural_feet_stay_on_the_floor(kind):
-    """If this fails, bodies float or wade: skirts and trousers then move as on nobody."""
-    body = rest_body()
-    frames, _ = skeleton.posed(body, procedural(body, kind, 90, seed=4))
-    lowest = frames[:, :, 1].min(1)
-    assert lowest.min() > -0.03
-    airborne = {"run": 0.09, "jump": 0.35}.get(kind, 0.03)  # heights of the flights, and smoothing by 50 ms
-    assert lowest.max() < airborne
-    assert np.median(lowest) < 0.05

@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from pathlib import Path
 from tokenize import TokenError
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -53,21 +54,72 @@ _UNREADABLE = (
     zlib.error,
 )  # fmt: skip
 LARGEST = 1e6  # of an angle [rad] and a position [m]
+NAMES = tuple(name for name, _, _ in _JOINTS)
 _PELVIS = np.array([0.0, -0.22, 0.03])  # rest position of the average body's root [m]; translations start from it
 _Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-def read_amass(path: str | Path) -> Clip:
+class Recorded(NamedTuple):
+    """What an AMASS file holds, in its own axes: Z up.
+
+    Attributes:
+        poses: Axis-angle of each joint of its model relative to its parent [rad], shape [T, J, 3].
+        trans: Translation [m], shape [T, 3].
+        betas: Coefficients of the model's shapes, shape [S]; empty where the file has none.
+        fps: Frames per second.
+    """
+
+    poses: np.ndarray
+    trans: np.ndarray
+    betas: np.ndarray
+    fps: float
+
+
+def read_amass(path: str | Path, up: str = "z") -> Clip:
     """Reads an AMASS-style .npz: `poses` [T, 66, 72, 156 or 165] axis-angles [rad], `trans` [T, 3] [m], a frame rate.
 
-    Gender and shape do not matter and are not read; nothing in the file is unpickled.
+    Gender and shape do not matter; nothing in the file is unpickled. `up` is the axis that points up in it, "y" or "z".
 
     Raises:
         MeshError: The file is no .npz, keys are missing or have other shapes, a number is not finite, or the frame
             rate is unknown.
     """
+    recorded = read_recorded(path)
+    poses, trans = recorded.poses, recorded.trans
+    turns = Rotation.from_rotvec(poses[:, : len(_JOINTS)].reshape(-1, 3)).as_matrix()
+    rotations = turns.reshape(len(poses), len(_JOINTS), 3, 3)
+    turn = _Z_UP_TO_Y_UP if up == "z" else np.eye(3)
+    rotations[:, 0] = turn @ rotations[:, 0]  # the root turns SMPL's axes, Y up, to those of the file
+    for joint, (_, parent, _) in enumerate(_JOINTS[1:], start=1):
+        rotations[:, joint] = rotations[:, parent] @ rotations[:, joint]
+    return Clip(
+        names=NAMES,
+        offsets=np.array([offset for _, _, offset in _JOINTS]),
+        rotations=rotations,
+        root=(trans + _PELVIS) @ turn.T,
+        fps=recorded.fps,
+        up=up,
+    )
+
+
+def is_amass(path: str | Path) -> bool:
+    """Whether an .npz holds joint angles, and no positions; False for a file that is no archive."""
+    try:
+        with open_plain(Path(path)) as file, zipfile.ZipFile(file) as archive:
+            names = set(archive.namelist())
+    except _UNREADABLE:
+        return False
+    return {"poses.npy", "trans.npy"} <= names and "vertices.npy" not in names
+
+
+def read_recorded(path: str | Path) -> Recorded:
+    """Reads what an AMASS file holds, in its own axes.
+
+    Raises:
+        MeshError: As of :func:`read_amass`.
+    """
     path = Path(path)
-    arrays = _opened(path, ("poses", "trans"))
+    arrays = _opened(path, ("poses", "trans", "betas"))
     poses, trans = arrays["poses"], arrays["trans"]
     _check_shape(path, poses.shape, poses.dtype)
     if trans.shape != (len(poses), 3) or trans.dtype.kind not in "fiu":
@@ -79,18 +131,11 @@ def read_amass(path: str | Path) -> Clip:
         raise MeshError(
             f"{path.name}: a number of {largest:g} in poses or trans, beyond {LARGEST:,.0f}. It is damaged."
         )
-    turns = Rotation.from_rotvec(poses[:, : 3 * len(_JOINTS)].reshape(-1, 3).astype(np.float64)).as_matrix()
-    rotations = turns.reshape(len(poses), len(_JOINTS), 3, 3)
-    rotations[:, 0] = _Z_UP_TO_Y_UP @ rotations[:, 0]  # the root turns SMPL's axes, Y up, to those of the file, Z up
-    for joint, (_, parent, _) in enumerate(_JOINTS[1:], start=1):
-        rotations[:, joint] = rotations[:, parent] @ rotations[:, joint]
-    return Clip(
-        names=tuple(name for name, _, _ in _JOINTS),
-        offsets=np.array([offset for _, _, offset in _JOINTS]),
-        rotations=rotations,
-        root=(trans.astype(np.float64) + _PELVIS) @ _Z_UP_TO_Y_UP.T,
-        fps=arrays["rate"],
-    )
+    betas = arrays.get("betas", np.zeros(0))
+    if betas.dtype.kind not in "fiu" or betas.ndim != 1 or not (np.abs(betas) <= LARGEST).all():
+        raise MeshError(f"{path.name}: betas must be finite numbers [S], got {betas.dtype} {list(betas.shape)}.")
+    turns = poses.astype(np.float64).reshape(len(poses), -1, 3)
+    return Recorded(turns, trans.astype(np.float64), betas.astype(np.float64), arrays["rate"])
 
 
 def amass_length(path: str | Path) -> tuple[int, float]:

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from warpgarment.bodies.rest import RestBody
+from warpgarment.bodies.skeleton import PoseSequence
 from warpgarment.errors import MeshError
-from warpgarment.training.bodies.anny import RestBody
-from warpgarment.training.bodies.skeleton import PoseSequence
 
 from .amass import amass_length, read_amass
 from .bvh import bvh_length, read_bvh
@@ -33,10 +33,12 @@ _DAZ = {
     "LeftShoulder": "lCollar", "LeftArm": "lShldr", "LeftForeArm": "lForeArm", "LeftHand": "lHand",
     "RightShoulder": "rCollar", "RightArm": "rShldr", "RightForeArm": "rForeArm", "RightHand": "rHand",
 }  # fmt: skip
+_MIXAMO = {"LowerBack": "Spine", "Spine": "Spine1", "Spine1": "Spine2"}  # the trunk, where it starts with Spine
 _LIMBS = {
     "LeftUpLeg": "LeftLeg", "LeftLeg": "LeftFoot", "RightUpLeg": "RightLeg", "RightLeg": "RightFoot",
     "LeftArm": "LeftForeArm", "LeftForeArm": "LeftHand", "RightArm": "RightForeArm", "RightForeArm": "RightHand",
 }  # fmt: skip
+_LEG = ("LeftUpLeg", "LeftLeg", "LeftFoot")
 _READERS = {".bvh": (read_bvh, bvh_length), ".npz": (read_amass, amass_length)}
 _FASTEST_ROOT = 12.0  # m/s, the speed of a sprinter
 _FASTEST_BONE = 1800.0  # degrees/s, twice the speed of a runner's shin
@@ -73,20 +75,19 @@ def _reader(path: str | Path) -> tuple[Callable[..., Clip], Callable[[str | Path
     return _READERS[path.suffix.lower()]
 
 
-def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
+def retarget(clip: Clip, body: RestBody, fps: float = 30.0, metres: float | None = None) -> PoseSequence:
     """The clip on another body, resampled to `fps` frames per second.
 
+    Args:
+        clip: The clip.
+        body: The body.
+        fps: Frames per second of the result.
+        metres: Metres in a unit of the clip, by which its root moves. None: :func:`metres_by_legs`.
+
     Raises:
-        MeshError: The clip's joints have neither the names of CMU MotionBuilder nor those of DAZ.
+        MeshError: The clip's joints have the names neither of CMU MotionBuilder, Mixamo nor DAZ.
     """
-    source = {name: name if name in clip.names else _DAZ.get(name) for name in body.bone_names}
-    source = {name: s if s in clip.names else None for name, s in source.items()}
-    missing = [name for name in ("Hips", *_LIMBS) if source[name] is None]
-    if missing:
-        raise MeshError(
-            f"{len(missing)} bones have no joint in the clip (first: {missing[0]}); its joints are "
-            f"{', '.join(clip.names[:6])}, ... Names of the CMU MotionBuilder or DAZ releases are understood."
-        )
+    source = _sources(clip, body)
     clip = resampled(clip, fps)
     rotations = np.empty((len(clip), len(body.bone_names), 3, 3))
     alignment = {a: _limb_alignment(clip, body, source, a, b) for a, b in _LIMBS.items()}
@@ -97,7 +98,38 @@ def retarget(clip: Clip, body: RestBody, fps: float = 30.0) -> PoseSequence:
             rotations[:, bone] = rotations[:, body.bone_parents[bone]]
         else:
             rotations[:, bone] = clip.rotations[:, clip.names.index(joint)] @ alignment.get(name, np.eye(3))
-    return PoseSequence(rotations, clip.root * _leg_ratio(clip, body, source), fps)
+    return PoseSequence(rotations, clip.root * (metres or _leg_ratio(clip, body, source)), fps)
+
+
+def metres_by_legs(clip: Clip, body: RestBody) -> tuple[float, float]:
+    """Metres in a unit of a clip with which its legs are as long as those of the body, and the length of these [m].
+
+    Raises:
+        MeshError: As of :func:`retarget`.
+    """
+    ratio = _leg_ratio(clip, body, _sources(clip, body))
+    return ratio, _leg_length(body)
+
+
+def _sources(clip: Clip, body: RestBody) -> dict[str, str | None]:
+    """The joint of the clip for each bone of the body; None takes the rotation of the bone's parent.
+
+    Raises:
+        MeshError: A limb has none.
+    """
+    plain = {name.rpartition(":")[2]: name for name in reversed(clip.names)}  # mixamorig:LeftLeg
+    three = _MIXAMO if "Spine2" in plain and "LowerBack" not in plain else {}
+    wanted = {name: three.get(name, name) for name in body.bone_names}
+    wanted = {name: s if s in plain else _DAZ.get(name) for name, s in wanted.items()}
+    source = {name: None if s is None else plain.get(s) for name, s in wanted.items()}
+    missing = [name for name in ("Hips", *_LIMBS) if source[name] is None]
+    if missing:
+        raise MeshError(
+            f"{len(missing)} bones have no joint in the clip (first: {missing[0]}); its joints are "
+            f"{', '.join(clip.names[:6])}, ... Names of the CMU MotionBuilder or DAZ releases are understood, and "
+            "those of Mixamo."
+        )
+    return source
 
 
 def jumps(body: RestBody, poses: PoseSequence) -> np.ndarray:
@@ -130,7 +162,11 @@ def _limb_alignment(clip: Clip, body: RestBody, source: dict[str, str | None], b
 
 
 def _leg_ratio(clip: Clip, body: RestBody, source: dict[str, str | None]) -> float:
-    bones = ("LeftUpLeg", "LeftLeg", "LeftFoot")
-    target = sum(np.linalg.norm(body.joint(b) - body.joint(a)) for a, b in itertools.pairwise(bones))
-    own = sum(np.linalg.norm(clip.offsets[clip.names.index(source[b])]) for b in bones[1:])
-    return float(target / own)
+    own = sum(np.linalg.norm(clip.offsets[clip.names.index(source[bone])]) for bone in _LEG[1:])
+    if own <= 0:
+        raise MeshError("the legs of the clip have no length. Repair what wrote it.")
+    return float(_leg_length(body) / own)
+
+
+def _leg_length(body: RestBody) -> float:
+    return float(sum(np.linalg.norm(body.joint(b) - body.joint(a)) for a, b in itertools.pairwise(_LEG)))

@@ -7,9 +7,9 @@ import os
 import numpy as np
 import pytest
 
+from warpgarment.bodies.amass import amass_length, read_amass
+from warpgarment.bodies.bvh import LARGEST_FILE, MOST_JOINTS, bvh_length, read_bvh
 from warpgarment.errors import MeshError
-from warpgarment.training.motions.amass import amass_length, read_amass
-from warpgarment.training.motions.bvh import LARGEST_FILE, MOST_JOINTS, bvh_length, read_bvh
 
 CLIP = """HIERARCHY
 ROOT Pelvis

@@ -25,8 +25,12 @@ LARGEST = 1e6  # of an offset, a position or an angle, in the file's units
 _CHANNEL = re.compile(r"[XYZ](position|rotation)")
 
 
-def read_bvh(path: str | Path) -> Clip:
-    """Reads a BVH file; a file with Z up (the mean head is above the hips along Z) is turned to Y up.
+def read_bvh(path: str | Path, up: str | None = None) -> Clip:
+    """Reads a BVH file; one with Z up is turned to Y up.
+
+    Args:
+        path: The file.
+        up: Axis that points up in it, "y" or "z". None: Z where the mean head is above the hips along Z, otherwise Y.
 
     Raises:
         MeshError: The file is not BVH, its numbers do not match its hierarchy, some are NaN, infinite or beyond
@@ -53,14 +57,16 @@ def read_bvh(path: str | Path) -> Clip:
     checked_finite(values.reshape(frames, width), path.name)
     rotations, positions = _forward(parents, offsets, channels, values.reshape(frames, width))
     head = next((i for i, n in enumerate(names) if n.lower() == "head"), len(names) - 1)
-    up = int(np.abs((positions[:, head] - positions[:, 0]).mean(0)).argmax())
-    turn = _Z_UP_TO_Y_UP if up == 2 else np.eye(3)
+    tallest = int(np.abs((positions[:, head] - positions[:, 0]).mean(0)).argmax())
+    up = up or ("z" if tallest == 2 else "y")
+    turn = _Z_UP_TO_Y_UP if up == "z" else np.eye(3)
     return Clip(
         names=tuple(names),
         offsets=offsets @ turn.T,
         rotations=turn @ rotations @ turn.T,
         root=positions[:, 0] @ turn.T,
         fps=frame_rate(1.0 / frame_time, path.name),
+        up=up,
     )
 
 

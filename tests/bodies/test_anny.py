@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from warpgarment.bodies import anny
 from warpgarment.io.npz import write_npz
-from warpgarment.training.bodies import anny
 
 
 def test_a_damaged_template_is_made_again(tmp_path, monkeypatch):

@@ -1,0 +1,1 @@
+"""Bodies that bones move: motions of skeletons (BVH, AMASS), and the surfaces that follow them."""
