@@ -53,5 +53,5 @@ $(VENV)/.demo: $(VENV)/.torch pyproject.toml
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.torch pyproject.toml
-	$(PIP) -c $(CONSTRAINTS) -e '.[dev,usd,alembic,view,train,physics,hub]'
+	$(PIP) -c $(CONSTRAINTS) -e '.[dev,usd,alembic,view,browser,train,physics,hub]'
 	@touch $@

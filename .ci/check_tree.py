@@ -23,7 +23,7 @@ except ModuleNotFoundError:  # Python 3.10, where mypy brings the same under ano
     import tomli as tomllib
 
 PACKAGES = {"warpgarment": "warpgarment", "kernels": "warpgarment.kernels", "training": "warpgarment.training"}
-FOLDERS = (*PACKAGES, "tests", "benchmarks", "examples", "findings", ".ci")
+FOLDERS = (*PACKAGES, "tests", "benchmarks", "examples", "findings", "integrations", ".ci")
 MOST_FILES, MOST_LINES = 15, 400  # in a folder, __init__.py not counted; in a file
 WARP = ("kernel", "func", "func_grad", "func_replay", "func_native")  # wp.kernel ...: their bodies are not Python
 

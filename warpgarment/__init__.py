@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from warpgarment.objects.outfit import Outfit
     from warpgarment.objects.status import RolloutStatus, Verdict
     from warpgarment.objects.wind import Wind
+    from warpgarment.sim.results.rerun import Rerun
     from warpgarment.sim.simulator import Simulator
+    from warpgarment.view.browser.page import browse
 
     from . import demo, kernels, metrics
     from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
@@ -45,11 +47,13 @@ __all__ = [
     "NotEnoughMemory",
     "Outfit",
     "PatchTransformer",
+    "Rerun",
     "RolloutStatus",
     "Simulator",
     "Verdict",
     "Wind",
     "__version__",
+    "browse",
     "checkpoint",
     "demo",
     "draw",
@@ -77,10 +81,12 @@ _HOME = {
     "NotEnoughMemory": "errors",
     "Outfit": "objects.outfit",
     "PatchTransformer": "nn.patches.network",
+    "Rerun": "sim.results.rerun",
     "RolloutStatus": "objects.status",
     "Simulator": "sim.simulator",
     "Verdict": "objects.status",
     "Wind": "objects.wind",
+    "browse": "view.browser.page",
     "fit": "objects.fit",
     "read_body": "objects.body",
 }

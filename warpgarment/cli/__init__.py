@@ -28,6 +28,7 @@ _EXTRAS = {
     "alembic3d": "alembic",
     "imath": "alembic",
     "pyvista": "window",
+    "viser": "browser",
     "imageio": "view",
     "imageio_ffmpeg": "view",
     "PIL": "view",

@@ -109,21 +109,24 @@ class Checked(NamedTuple):
         check_read(reads, weights, {"materials": bool(self.materials), "wind": self.windy})
 
 
-def checked(shot: Shot, materials: Sequence[Any] | None = None, pins: Sequence[Any] = ()) -> Checked:
+def checked(
+    shot: Shot, materials: Sequence[Any] | None = None, pins: Sequence[Any] = (), *, written: bool = True
+) -> Checked:
     """Checks options as far as that is possible without loading files.
 
     Args:
         shot: The options.
         materials: Materials, as of `materials_of`, in place of those of the options.
         pins: As of `Checked`.
+        written: Whether the result is written.
 
     Raises:
         UsageError, OutputError, FileExistsError, FileNotFoundError, MissingExtra: What cannot be, or be written.
     """
-    if shot.out is None:
+    if shot.out is None and written:
         raise UsageError("--out is missing: where to write the result.")
     pieces = pieces_of(shot.files[:-1], shot.garment_mesh)
-    outputs = outputs_of(shot.out, pieces, (*shot.files, shot.fit_rest))
+    outputs = {} if shot.out is None else outputs_of(shot.out, pieces, (*shot.files, shot.fit_rest))
     if isinstance(shot.out_fps, float) and not 0 < shot.out_fps < math.inf:
         raise UsageError(f"--out-fps {shot.out_fps:g}: a positive number of frames a second, body or network.")
     known = materials_of(shot.material if materials is None else materials, len(pieces))
@@ -219,3 +222,8 @@ def _body(path: Path, shot: Shot, body: Load, where: str, **more: Any) -> BodyMo
     with spoken(where, mesh="--body-mesh", unit="--body-unit", up="--body-up", fps="--body-fps", shape="--body-shape"):
         found: BodyMotion = body(path, **told | more)
     return found
+
+
+def whole_body(shot: Shot) -> BodyMotion:
+    """The body with the parts that garments do not collide with, such as hands."""
+    return _body(shot.files[-1], shot, BodyMotion.load, "", collider=False)

@@ -39,6 +39,13 @@ class Simulate(Shot):
     jobs.results.jsonl."""
     again: bool = False
     """Run all jobs of the list, those that are done too."""
+    browser: bool = False
+    """Show the garments on a page that a web browser opens, instead of writing them: with sliders for the wind and
+    menus for materials, which run the simulation again, for networks that read them (--weights layers)."""
+    host: str = "127.0.0.1"
+    """Address of the page; 0.0.0.0 lets everybody on the network look, and move the sliders."""
+    port: int | None = None
+    """Port of the page; by default 8080 or the next one that is free."""
 
 
 def run(options: Simulate) -> int:
@@ -47,6 +54,8 @@ def run(options: Simulate) -> int:
     Returns:
         The exit status: 0, or `NOT_FREE` for layers that cross somewhere, or were not looked at; or `JOBS_FAILED`.
     """
+    if options.jobs is not None and options.browser:
+        raise UsageError("--browser and --jobs: give one of them.")
     if options.jobs is not None:
         from .jobs.run import run_jobs
 
@@ -57,6 +66,11 @@ def run(options: Simulate) -> int:
         raise UsageError("--batch, --results and --again belong to a list of jobs: give it with --jobs.")
     if not options.files:
         raise UsageError("simulate was given no files. Name garments, innermost first, and then the body; or --jobs.")
+    if options.browser:
+        from .browser import rerun
+
+        rerun(options)
+        return 0
     known = checked(options)
     from warpgarment.sim.simulator import Simulator
 

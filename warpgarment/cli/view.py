@@ -1,4 +1,4 @@
-"""`warpgarment view`: a motion in a window, or drawn to a file where there is no display."""
+"""`warpgarment view`: a motion in a window or a browser, or drawn to a file where there is no display."""
 
 from __future__ import annotations
 
@@ -46,6 +46,17 @@ class View:
     body_start: float | None = None
     """Time of the body's first frame in seconds, likewise. Motions of any rates are shown at the same moments: those
     frames of the first motion that lie in the time of all."""
+    browser: bool = False
+    """Show the motions on a page that a web browser opens, instead of a window. Files with several meshes are shown
+    whole, and the one called body is the body."""
+    beside: tuple[Path, ...] = ()
+    """Motions of a second result, which the page shows beside the first one, and the distance to it in colours."""
+    rest: tuple[Path, ...] = ()
+    """The garments at rest, for colours of stretch on the page; by default their first frames."""
+    host: str = "127.0.0.1"
+    """Address of the page; 0.0.0.0 lets everybody on the network look."""
+    port: int | None = None
+    """Port of the page; by default 8080 or the next one that is free."""
     out: Path | None = None
     """Draw to this file instead of a window: .mp4 the film, .png a sheet of moments."""
     frames: int = 8
@@ -57,9 +68,17 @@ class View:
 
 
 def run(options: View) -> None:
-    """Draws to a file, or opens a window."""
+    """Draws to a file, opens a window, or serves a page."""
     if not options.motion:
         raise UsageError("view was given no motion. Name at least one file.")
+    if options.browser and options.out is not None:
+        raise UsageError("--browser and --out: give one of them.")
+    if options.browser:
+        from .browser import show
+
+        return show(options)
+    if options.beside or options.rest:
+        raise UsageError("--beside and --rest belong to the page in the browser: give them with --browser.")
     if options.out is not None:
         check_output(options.out, (".png", ".mp4"))
     _check_picture(options)
