@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
     from .geometry import geodesics
     from .sim import memory
+    from .sim.results import differentiable
     from .view import draw
 
     __version__: str
@@ -52,6 +53,7 @@ __all__ = [
     "__version__",
     "checkpoint",
     "demo",
+    "differentiable",
     "draw",
     "fit",
     "geodesics",
@@ -85,6 +87,7 @@ _HOME = {
 _MODULES = {
     "checkpoint": "nn.checkpoint",
     "demo": "demo",
+    "differentiable": "sim.results.differentiable",
     "draw": "view.draw",
     "geodesics": "geometry.geodesics",
     "kernels": "kernels",
