@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
     from .geometry import geodesics
     from .sim import memory
+    from .sim.results import differentiable
     from .view import draw
 
     __version__: str
@@ -56,6 +57,7 @@ __all__ = [
     "browse",
     "checkpoint",
     "demo",
+    "differentiable",
     "draw",
     "fit",
     "geodesics",
@@ -93,6 +95,7 @@ _HOME = {
 _MODULES = {
     "checkpoint": "nn.checkpoint",
     "demo": "demo",
+    "differentiable": "sim.results.differentiable",
     "draw": "view.draw",
     "geodesics": "geometry.geodesics",
     "kernels": "kernels",

@@ -240,7 +240,8 @@ class Simulator:
         known_materials = as_materials(told.materials, len(garments), self.network, self.device)
         blown, worn = as_wind(wind, len(garments), self.network), outfits(told.layers, on)
         blowing = [air_of(blown, frame, self.device) for frame in range(max(lengths))]
-        states = self._begin(brought, single, packed, first, face_splits, worn, known_materials, blowing[:given])
+        with torch.inference_mode():
+            states = self._begin(brought, single, packed, first, face_splits, worn, known_materials, blowing[:given])
         state, total = states[0], max(lengths)
         recording = Recording(states[0].scene, lengths, READ_EVERY if self.device.type == "cuda" else 1)
         with evaluating(self.network):
@@ -321,8 +322,9 @@ class Simulator:
         first = packed_on([b.vertices[0] for b in checked], self.device)
         known_materials = as_materials(told.materials, len(garments), self.network, self.device)
         air, worn = as_wind(wind, len(garments), self.network, frame=0), outfits(told.layers, on)
-        blown = [air_of(air, 0, self.device)]
-        return self._begin(brought, single, packed, [first], face_splits, worn, known_materials, blown)[0]
+        with torch.inference_mode():
+            blown = [air_of(air, 0, self.device)]
+            return self._begin(brought, single, packed, [first], face_splits, worn, known_materials, blown)[0]
 
     def step(
         self, state: SimulationState[Vertices, Status], next_body_vertices: Any, *, wind: Any = None
@@ -346,7 +348,6 @@ class Simulator:
             air = as_wind(wind, len(state.scene.garments), self.network, frame=state.frame + 1)
             return self._advance(state, packed_on(arrays, self.device), air_of(air, 0, self.device))
 
-    @torch.inference_mode()
     def _begin(
         self,
         brought: Brought,
@@ -393,8 +394,6 @@ class Simulator:
         self, state: SimulationState[Vertices, Status], next_body: torch.Tensor, wind: torch.Tensor | None
     ) -> SimulationState[Vertices, Status]:
         scene, now = state.scene, state.now.blown(wind)
-        if state.graph is None or self.timings.synchronise:
-            after = advance(scene, now, next_body)
-        else:
-            after = state.graph(now, next_body)
+        graph = None if self.timings.synchronise else state.graph
+        after = advance(scene, now, next_body) if graph is None else graph(now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)

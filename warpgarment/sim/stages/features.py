@@ -6,6 +6,7 @@ import torch
 
 from warpgarment.kernels.deformation.face_means import FaceMeans
 from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
+from warpgarment.kernels.features.channels import FEATURES, LAYOUT
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction, face_features, frame_features
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.bodies import MovingBodies
@@ -21,7 +22,14 @@ class Features:
         body_of_face: Body of each face, int32 [F].
         bodies: The bodies.
         timings: Times of the stages, to which this one adds its own as "features".
+
+    Attributes:
+        sliding: Whether gradients take the nearest body point of a face as one that slides along its flat body face, so
+            that the direction to the body is constant; otherwise as one that stays where it is, so that the direction
+            turns. The former is closer to what finite differences give.
     """
+
+    sliding = False
 
     def __init__(
         self,
@@ -82,4 +90,9 @@ class Features:
     def _from(self, vertices: torch.Tensor, centroids: torch.Tensor, interaction: BodyInteraction) -> torch.Tensor:
         packed = self._packed
         mean = segment_mean(centroids, packed.garment_of_face, packed.count)
-        return face_features(self._inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, interaction)
+        found = face_features(self._inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, interaction)
+        if not (self.sliding and found.requires_grad):
+            return found
+        columns = LAYOUT["direction_to_body"]
+        before, direction, after = found.split([columns.start, 3, FEATURES - columns.stop], dim=1)
+        return torch.cat([before, direction.detach(), after], dim=1)
