@@ -4,6 +4,7 @@
     python -m benchmarks --quick                       # fewer sizes, one or two minutes
     python -m benchmarks --only stages roofline
     python -m benchmarks --faces 1000 --batch 1 8      # other sizes and batches
+    python -m benchmarks against 1a9fae1               # beside an earlier build, see benchmarks/against
 
 The parts are `geodesics`, distances over the cloth; `stages`, each kernel beside the published method; `batch`, whole
 frames, packed and one by one; `roofline`, the network beside the device's own rates; `teacher`, whole frames beside
@@ -24,6 +25,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.against.__main__ import main as against
 from benchmarks.measure import RESULTS, Row, machine
 from benchmarks.networks import DEFAULT, named
 from warpgarment.io.disk.atomic import atomic_files
@@ -82,7 +84,10 @@ def shown(rows: Iterable[Row]) -> Iterator[Row]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs the parts that the arguments name and writes the results."""
+    """Runs the parts that the arguments name and writes the results; `against` is `benchmarks/against`."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given[:1] == ["against"]:
+        return against(given[1:])
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to run")
     parser.add_argument("--faces", type=int, nargs="+", help="sizes of the garment")

@@ -51,6 +51,10 @@ ORTHOGONAL = wp.constant(wp.float64(1.0e-26))
 SWEEPS = wp.constant(16)  # a limit that is never reached
 # Second singular value over the first below which its direction is rounding
 FLAT = wp.constant(wp.float64(1.0e-14))
+# Determinant over the cube of the length below which a matrix is no map of cloth or skin; its rotation is by `svd`
+SQUASHED = wp.constant(wp.float64(1.0e-3))
+ROUNDS = wp.constant(12)  # limit of Newton's iteration; a body's faces take three or four
+TURNED = wp.constant(wp.float64(1.0e-16))  # squared change after which the next one is below rounding
 
 
 @wp.func
@@ -122,6 +126,38 @@ def svd(m: wp.mat33d):
     last = wp.cross(va, vb)  # vc or its opposite
     third = wp.dot(uc, c) * wp.dot(last, vc)
     return wp.matrix_from_cols(ua, ub, uc), wp.vec3d(first, second, third), wp.matrix_from_cols(va, vb, last)
+
+
+@wp.func
+def rotation_of(m: wp.mat33d):
+    """The nearest proper rotation, by Newton's iteration X <- (X + X⁻ᵀ)/2 (Higham 1986), a quarter of the time of `svd`.
+
+    It converges quadratically from any matrix with a positive determinant, and fast from those that stretch little.
+    """
+    half = wp.float64(0.5)
+    a = wp.vec3d(m[0, 0], m[1, 0], m[2, 0])
+    b = wp.vec3d(m[0, 1], m[1, 1], m[2, 1])
+    c = wp.vec3d(m[0, 2], m[1, 2], m[2, 2])
+    size = wp.dot(a, a) + wp.dot(b, b) + wp.dot(c, c)
+    volume = wp.dot(a, wp.cross(b, c))
+    change = wp.float64(1.0)
+    if volume > SQUASHED * size * wp.sqrt(size):
+        rounds = wp.int32(0)
+        while change > TURNED and rounds < ROUNDS:
+            scale = half / wp.dot(a, wp.cross(b, c))
+            x = half * a + scale * wp.cross(b, c)
+            y = half * b + scale * wp.cross(c, a)
+            z = half * c + scale * wp.cross(a, b)
+            change = wp.length_sq(x - a) + wp.length_sq(y - b) + wp.length_sq(z - c)
+            a = x
+            b = y
+            c = z
+            rounds += 1
+    turn = wp.matrix_from_cols(a, b, c)
+    if not change <= TURNED:
+        u, _sigma, v = svd(m)
+        turn = u * wp.transpose(v)
+    return turn
 
 
 @wp.func
@@ -241,6 +277,18 @@ def replace_singular_values_kernel(
     replaced[i] = with_singular_values(phi[i], values[i])
 
 
+@wp.kernel(enable_backward=False)
+def rotation_kernel(
+    # In:
+    phi: wp.array[wp.mat33],
+    # Out:
+    turn: wp.array[wp.mat33],
+):
+    i = wp.tid()
+    turn[i] = wp.mat33(rotation_of(wp.mat33d(phi[i])))
+
+
+_rotation = row_operator("rotation", rotation_kernel, {"phi": wp.mat33}, {"turn": (wp.mat33, (3, 3))}, rows="phi")
 _singular_values = row_operator(
     "singular_values",
     singular_values_kernel,
@@ -301,4 +349,6 @@ def rotation(phi: torch.Tensor) -> torch.Tensor:
         Rotations with determinant +1, float32 [F, 3, 3]. Differentiable in phi.
     """
     expect("phi", phi, (None, 3, 3))
-    return _replace_singular_values(phi, phi.new_ones(phi.shape[:2]))
+    if phi.requires_grad and torch.is_grad_enabled():
+        return _replace_singular_values(phi, phi.new_ones(phi.shape[:2]))
+    return _rotation(phi)
