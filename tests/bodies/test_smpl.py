@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.bodies import write_amass, write_bvh
-from support.smpl import PARENTS, write_model
+from support.files.smpl import PARENTS, write_model
 
 import warpgarment as wg
 from warpgarment.bodies.amass import read_recorded

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.readers import QUADS, STRIP, TRIANGLES, mat_file, moving, write_obj, write_point_cache
+from support.files.readers import QUADS, STRIP, TRIANGLES, mat_file, moving, write_obj, write_point_cache
 
 from warpgarment.errors import MeshError
 from warpgarment.objects.body import BodyMotion

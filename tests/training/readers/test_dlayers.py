@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.readers import STRIP, TRIANGLES, moving
+from support.files.readers import STRIP, TRIANGLES, moving
 
 from warpgarment.errors import MeshError
 from warpgarment.objects.body import BodyMotion

@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from support.readers import QUADS, STRIP, TRIANGLES, moving, write_obj, write_point_cache, write_usda
+from support.files.readers import QUADS, STRIP, TRIANGLES, moving, write_obj, write_point_cache, write_usda
 
 from warpgarment.errors import MeshError
 from warpgarment.objects.body import BodyMotion

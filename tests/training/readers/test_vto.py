@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.readers import STRIP, TRIANGLES, moving, write_obj
+from support.files.readers import STRIP, TRIANGLES, moving, write_obj
 
 from warpgarment.errors import MeshError
 from warpgarment.objects.motion import GarmentMotion

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.chromium import FOUND, Chromium
+from support.pages.chromium import FOUND, Chromium
 
 import warpgarment as wg
 
