@@ -132,7 +132,8 @@ def svd(m: wp.mat33d):
 def rotation_of(m: wp.mat33d):
     """The nearest proper rotation, by Newton's iteration X <- (X + X⁻ᵀ)/2 (Higham 1986).
 
-    It takes a quarter of the time of `svd`. It converges quadratically from any matrix with a positive determinant, and fast from those that stretch little.
+    It takes a quarter of the time of `svd`. It converges quadratically from any matrix with a positive determinant,
+    and fast from those that stretch little.
     """
     half = wp.float64(0.5)
     a = wp.vec3d(m[0, 0], m[1, 0], m[2, 0])
