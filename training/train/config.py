@@ -125,6 +125,11 @@ class TrainConfig:
         if self.unroll.steps > 1 and self.augmentation.scale:
             raise ValueError("unrolled samples keep their size: set augmentation.scale to 0, or unroll.steps to 1")
 
+    @property
+    def overridden(self) -> tuple[str, ...]:
+        """Names of the overrides."""
+        return tuple(text.partition("=")[0] for text in self.overrides)
+
     def network_config(self) -> NetworkConfig:
         """The network's shape with the overrides applied."""
         named = preset(self.network)

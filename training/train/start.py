@@ -19,15 +19,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 
+from warpgarment.errors import UsageError
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.disk.leftovers import remove_leftovers
 from warpgarment.io.disk.outputs import check_space, check_writable
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import architecture, build_network
+from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.distributed import Group, GroupError
 from warpgarment.training.samples.loader import Plan
@@ -44,6 +47,7 @@ from .training_set import NoTrainingData, load_sequences, load_validation, repor
 __all__ = ["CompileFailed", "GroupError", "NoTrainingData", "NonFiniteLoss", "Run", "TrainConfig", "train"]
 
 
+WITHOUT_WEIGHTS = ("physics", "physics_pull")  # settings that a trained network can be given
 KEPT = 10  # times the weights: those of two networks, and a state of four sets, written beside the old one
 
 
@@ -58,6 +62,7 @@ def train(config: TrainConfig) -> Path:
         NonFiniteLoss: The loss or gradient is not finite any more.
         GrowthError: `init` cannot be grown to the shape wanted.
         CompileFailed: `compile` is set, and compilation failed.
+        UsageError: An override is none, or contradicts `init`.
         CheckpointError: `init` or the state to resume from cannot be read or does not fit.
         GroupError: The processes cannot work together.
         OutputError: `out` cannot be written to, or the disk has no room for the networks and the state.
@@ -70,15 +75,34 @@ def train(config: TrainConfig) -> Path:
         return _train(config, group, began)
 
 
+def _override(network: GarmentNetwork, wanted: NetworkConfig, names: Iterable[str]) -> None:
+    """Gives a trained network those of the overrides that no weight depends on.
+
+    Raises:
+        UsageError: It has another value of one that weights depend on.
+    """
+    free = {name: getattr(wanted, name) for name in names if name in WITHOUT_WEIGHTS}
+    network.config = dataclasses.replace(network.config, **free)
+    for name in names:
+        has, wants = getattr(network.config, name, None), getattr(wanted, name)
+        more = name == "outdoor" and set(wants) <= set(has)  # channels are added to those that there are
+        if has != wants and not more and name != "dropout":  # of which the default of the overrides speaks, too
+            raise UsageError(
+                f"overrides: {name}={wants}, but the network from init has {has}, and its weights depend on it. Leave "
+                f"{name} out, or start without init"
+            )
+
+
 def _train(config: TrainConfig, group: Group, began: float) -> Path:
     group.part(config.batch_size)
     torch.manual_seed(config.seed)
+    wanted = config.network_config()
     if config.init is not None:
         given = checkpoint.load(checkpoint.find(config.init), device=group.device)
-        wanted = config.network_config()
         network = architecture(wanted.architecture).start_from(given, wanted, grow=config.grow)
+        _override(network, wanted, config.overridden)
     else:
-        network = build_network(config.network_config()).to(group.device)
+        network = build_network(wanted).to(group.device)
     check_space(Path(config.out), KEPT * 4 * network.parameter_count())
     skipped: dict[str, str] = {}
     try:
