@@ -21,22 +21,20 @@ import zipfile
 from pathlib import Path
 
 PACKAGES = {"warpgarment": "warpgarment", "kernels": "warpgarment/kernels", "training": "warpgarment/training"}
-CODE = ("*.py", "py.typed")
 OTHERS = ("LICENSE", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "constraints.txt", "pyproject.toml")
 NOT_IN_ALL = {"all", "dev"}  # extras that `all` leaves out
 BUILD = "import sys; from setuptools import build_meta as b; print(getattr(b, 'build_' + sys.argv[1])(sys.argv[2]))"
 
 
 def expected(root: Path) -> dict[str, Path]:
-    """Files of the package in the tree at `root`, by their names in the wheel."""
+    """Files of the package in the tree at `root`, by their names in the wheel: all but pages about the code."""
     found = {}
     for folder, place in PACKAGES.items():
-        for file in [
-            *(file for kind in CODE for file in (root / folder).rglob(kind)),
-            *(root / folder).glob("assets/**/*"),
-        ]:
-            if file.is_file() and "__pycache__" not in file.parts:
-                found[f"{place}/{file.relative_to(root / folder).as_posix()}"] = file
+        for file in (root / folder).rglob("*"):
+            name = file.relative_to(root / folder).as_posix()
+            page = file.suffix == ".md" and not name.startswith("assets/")
+            if file.is_file() and "__pycache__" not in file.parts and not page:
+                found[f"{place}/{name}"] = file
     return found
 
 

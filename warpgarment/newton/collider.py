@@ -37,9 +37,8 @@ class ShapeCollider:
     """
 
     def __init__(self, model: newton.Model, shapes: Sequence[int] | None = None) -> None:
-        of_body, of_world = model.shape_body.numpy(), model.shape_world.numpy()
-        flags, kinds, scales = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_scale.numpy()
-        placed = model.shape_transform.numpy()
+        names = ("body", "world", "flags", "type", "scale", "transform")
+        of_body, of_world, flags, kinds, scales, placed = (getattr(model, f"shape_{name}").numpy() for name in names)
         moving = (of_body >= 0) & ((flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0)
         chosen = np.flatnonzero(moving) if shapes is None else np.asarray(list(shapes), dtype=int)
         worlds = max(1, model.world_count)

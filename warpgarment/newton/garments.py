@@ -35,9 +35,10 @@ def add_garment(
     placed = np.asarray(garment.vertices if first_vertices is None else first_vertices, dtype=np.float32)
     if placed.shape != garment.vertices.shape:
         raise ValueError(f"first_vertices must have shape {list(garment.vertices.shape)}, got {list(placed.shape)}")
+    upright: Any = wp.quat_identity()
     builder.add_cloth_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
-        rot=wp.quat_identity(),
+        rot=upright,
         scale=1.0,
         vel=wp.vec3(0.0, 0.0, 0.0),
         vertices=[wp.vec3(*map(float, point)) for point in from_y_up(placed, int(builder.up_axis))],

@@ -269,8 +269,8 @@ class SolverNeuralGarment(SolverBase):
             share = min(max(self.time * self.fps - self._frames, 0.0), 1.0)
             positions = torch.lerp(self._last, self._newest, share)
         velocities = (self._newest - self._last) * self.fps
-        for array, values in ((state.particle_q, positions), (state.particle_qd, velocities)):
-            target = wp.to_torch(array, requires_grad=False)
+        for name, values in (("particle_q", positions), ("particle_qd", velocities)):
+            target = wp.to_torch(getattr(state, name), requires_grad=False)
             written = from_y_up(values, self._axis)
             target.copy_(written if worlds is None else picked(worlds[self._of_particle], written, target))
 
@@ -316,13 +316,14 @@ def _of_worlds(model: newton.Model, garments: Garments) -> tuple[list[Garment], 
         ValueError: Their vertices are not the particles of the model.
     """
     worlds = max(1, model.world_count)
-    each = [garments] if isinstance(garments, Garment) else list(garments)
+    each: list[Any] = [garments] if isinstance(garments, Garment) else list(garments)
     if all(isinstance(item, Garment) for item in each):
         each = [each] * worlds
     if len(each) != worlds:
         raise ValueError(f"{worlds} worlds and garments for {len(each)}; give a list for each, or one for all")
     found = [(garment, world) for world, listed in enumerate(each) for garment in listed]
-    starts = model.particle_world_start.numpy() if model.world_count else np.array([0, model.particle_count])
+    begins: Any = model.particle_world_start
+    starts = begins.numpy() if model.world_count else np.array([0, model.particle_count])
     for world in range(worlds):
         wanted = sum(len(garment.vertices) for garment, on in found if on == world)
         there = int(starts[world + 1] - starts[world])
