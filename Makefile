@@ -1,5 +1,6 @@
 # make demo    installs the package in .venv and rolls out the bundled garments (out/demo/)
 # make test    installs what the tests need and runs them
+# make dist    builds sdist and wheel (dist/), and runs the demo from the wheel in an empty environment
 # make lint    ruff, and .ci/check_tree.py: types, directions of imports, folders, files
 # make bench   times a rollout by stage on this machine
 # make gpu     on a machine with a GPU: what it computes beside a CPU, then all benchmarks
@@ -18,7 +19,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 # torch is installed first and by itself; left in, its line would contradict another TORCH
 CONSTRAINTS := $(VENV)/constraints.txt
 
-.PHONY: demo test lint bench gpu clean
+.PHONY: demo test dist lint bench gpu clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.demo
@@ -32,6 +33,9 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/python .ci/check_tree.py
 
+dist: $(VENV)/.test
+	$(BIN)/python .ci/check_dist.py dist
+
 bench: $(VENV)/.demo
 	$(BIN)/warpgarment bench $(if $(DEVICE),--device $(DEVICE))
 
@@ -40,7 +44,7 @@ gpu: $(VENV)/.test
 	$(BIN)/python -m benchmarks
 
 clean:
-	rm -rf $(VENV) out build
+	rm -rf $(VENV) out build dist
 
 $(VENV)/.torch: constraints.txt
 	$(PYTHON) -m venv $(VENV)

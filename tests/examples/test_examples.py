@@ -107,3 +107,14 @@ def test_wind_that_lifts_a_hem(tmp_path, capsys) -> None:
     printed = capsys.readouterr().out
     assert float(printed.split("an ordinary rollout lifts the hem by ")[1].split(" cm")[0]) == pytest.approx(1, abs=0.1)
     assert {p.name for p in tmp_path.iterdir()} == {"hem.png", "dress.pc2", "dress.obj"}
+
+
+def test_newton_humanoid(tmp_path, capsys) -> None:
+    """The solver for Newton does not run in a script, or the humanoid comes out of its dress: over 2 cm deep."""
+    _run("09_newton_humanoid", out=tmp_path, seconds=0.2, substeps=1, around=20, rings=12)
+    printed = capsys.readouterr().out
+    assert printed.startswith("7 frames of 2 worlds")
+    assert float(printed.split("at the end ")[1].split(" mm")[0]) < 20
+    assert {f"{what}_{world}.usd" for what in ("dress", "humanoid") for world in (0, 1)} <= {
+        path.name for path in tmp_path.iterdir()
+    }

@@ -233,7 +233,8 @@ def generate(config: GenerateConfig) -> Path:
     """
     from tqdm import tqdm
 
-    from .cluster import on_cluster
+    from warpgarment.cluster import on_cluster
+
     from .workers import spread
 
     config = replace(config, out=Path(config.out), motions=Path(config.motions) if config.motions else None)

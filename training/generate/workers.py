@@ -14,19 +14,11 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-
-@dataclass(frozen=True)
-class Done:
-    """The outcome of an item: its `result`, or an `error` if its function raised or its process died."""
-
-    item: Any
-    result: Any = None
-    error: str | None = None
+from warpgarment.cluster import Done
 
 
 def spread(function: Callable[[Any], Any], items: Iterable[Any], processes: int) -> Iterator[Done]:

@@ -120,8 +120,8 @@ def _sources(clip: Clip, body: RestBody) -> dict[str, str | None]:
     plain = {name.rpartition(":")[2]: name for name in reversed(clip.names)}  # mixamorig:LeftLeg
     three = _MIXAMO if "Spine2" in plain and "LowerBack" not in plain else {}
     wanted = {name: three.get(name, name) for name in body.bone_names}
-    wanted = {name: s if s in plain else _DAZ.get(name) for name, s in wanted.items()}
-    source = {name: None if s is None else plain.get(s) for name, s in wanted.items()}
+    named = {name: s if s in plain else _DAZ.get(name) for name, s in wanted.items()}
+    source = {name: None if s is None else plain.get(s) for name, s in named.items()}
     missing = [name for name in ("Hips", *_LIMBS) if source[name] is None]
     if missing:
         raise MeshError(

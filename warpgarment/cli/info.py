@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -46,7 +46,7 @@ def run(options: Info) -> None:
     columns = {}
     with spoken(mesh="--mesh", unit="--unit", up="--up", fps="--fps", shape="--shape"):
         for name in chosen:
-            told = {"unit": options.unit, "up": options.up, "mesh": name}
+            told: dict[str, Any] = {"unit": options.unit, "up": options.up, "mesh": name}
             data = read_motion(path, **told, shape=options.shape)
             vertices, faces = np.asarray(data.vertices), np.asarray(data.faces)
             rate = rate_of(path, data, options.fps)

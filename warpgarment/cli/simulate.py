@@ -37,6 +37,9 @@ class Simulate(Shot):
     results: Path | None = None
     """Where the outcome of each job is kept, with --jobs, from which a run goes on; by default beside the list, as
     jobs.results.jsonl."""
+    ray: str | None = None
+    """Spread the batches of --jobs over a Ray cluster: its address, or local for one on this machine (extra cluster).
+    A batch takes a core, with --device cuda a GPU; all machines see the same files at the same paths."""
     again: bool = False
     """Run all jobs of the list, those that are done too."""
     browser: bool = False
@@ -60,10 +63,17 @@ def run(options: Simulate) -> int:
         from .jobs.run import run_jobs
 
         return run_jobs(
-            options, options.jobs, options.weights, options.device, options.batch, options.results, options.again
+            options,
+            options.jobs,
+            options.weights,
+            options.device,
+            options.batch,
+            options.results,
+            options.again,
+            options.ray,
         )
-    if options.batch is not None or options.results is not None or options.again:
-        raise UsageError("--batch, --results and --again belong to a list of jobs: give it with --jobs.")
+    if options.batch is not None or options.results is not None or options.ray is not None or options.again:
+        raise UsageError("--batch, --results, --ray and --again belong to a list of jobs: give it with --jobs.")
     if not options.files:
         raise UsageError("simulate was given no files. Name garments, innermost first, and then the body; or --jobs.")
     if options.browser:

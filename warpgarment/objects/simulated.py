@@ -49,6 +49,11 @@ class Simulated:
             unit = _units(loose, went[self.riders])
             self._carried = Carried(brought[self.riders], unit, self.garment.vertices, self.garment.faces)
 
+    @property
+    def whole(self) -> bool:
+        """Whether all vertices are simulated, each as itself."""
+        return self._as_it_is
+
     def reduced(self, positions: np.ndarray) -> np.ndarray:
         """Positions [..., U, 3] of all vertices -> [..., V, 3] of those that are simulated."""
         return positions if self._as_it_is else positions[..., self._shown, :]

@@ -25,7 +25,9 @@ class Progress:
         self.total, self.through, self.failed, self.begun = total, 0, 0, time.monotonic()
 
     def passed(self, jobs: int, failed: int, seconds: float) -> None:
-        """Counts a batch, and prints a line."""
+        """Counts a batch, and prints a line, unless there is nothing to run here."""
+        if not self.total:
+            return
         self.through, self.failed = self.through + jobs, self.failed + failed
         text = f"{self.through:,} of {self.total:,} jobs"
         if self.failed:

@@ -1,13 +1,29 @@
-"""Work spread over a Ray cluster (extra `cluster`), in place of the processes of `workers`."""
+"""Work spread over a Ray cluster (extra `cluster`): the data of `generate`, the batches of `simulate --jobs`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from warpgarment.errors import MissingExtra
 
-from .workers import Done
+
+@dataclass(frozen=True)
+class Done:
+    """The outcome of an item: its `result`, or an `error` if its function raised or its process died.
+
+    Attributes:
+        item: The item.
+        result: What the function returned.
+        error: What went wrong; None: nothing.
+        lost: Whether the process died, so that another item may be at fault.
+    """
+
+    item: Any
+    result: Any = None
+    error: str | None = None
+    lost: bool = False
 
 
 def on_cluster(
@@ -51,7 +67,7 @@ def on_cluster(
             except ray.exceptions.RayTaskError as error:
                 yield Done(item, error=f"{type(error.cause).__name__}: {error.cause}")
             except ray.exceptions.RayError as error:
-                yield Done(item, error=f"{type(error).__name__}: {str(error).splitlines()[0]}")
+                yield Done(item, error=f"{type(error).__name__}: {str(error).splitlines()[0]}", lost=True)
     finally:
         if started:
             ray.shutdown()

@@ -7,7 +7,7 @@ import signal
 
 import ray
 
-from warpgarment.training.generate.cluster import on_cluster
+from warpgarment.cluster import on_cluster
 
 
 def test_results_and_errors_come_back_from_a_cluster_on_this_machine():
@@ -24,4 +24,5 @@ def test_results_and_errors_come_back_from_a_cluster_on_this_machine():
     assert {i: d.result for i, d in done.items() if d.error is None} == {0: 0, 1: 1}
     assert done[2].error == "ValueError: two is not good"
     assert "died" in done[3].error or "Crashed" in done[3].error
+    assert [done[i].lost for i in range(4)] == [False, False, False, True]
     assert not ray.is_initialized(), "the cluster that was started here is still running"
