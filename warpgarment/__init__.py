@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from warpgarment.dressing.dress import Dressed, dress
     from warpgarment.nn import checkpoint
     from warpgarment.nn.config import NetworkConfig
     from warpgarment.nn.faces.network import ManifoldAwareTransformer
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from warpgarment.view.browser.page import browse
 
     from . import demo, kernels, metrics
-    from .errors import CheckpointError, MeshError, MissingExtra, NotEnoughMemory
+    from .errors import CheckpointError, DressingError, MeshError, MissingExtra, NotEnoughMemory
     from .geometry import geodesics
     from .sim import memory
     from .sim.results import differentiable
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 __all__ = [
     "BodyMotion",
     "CheckpointError",
+    "Dressed",
+    "DressingError",
     "Garment",
     "GarmentMotion",
     "LayersNet",
@@ -59,6 +62,7 @@ __all__ = [
     "demo",
     "differentiable",
     "draw",
+    "dress",
     "fit",
     "geodesics",
     "kernels",
@@ -71,6 +75,8 @@ __all__ = [
 _HOME = {
     "BodyMotion": "objects.body",
     "CheckpointError": "errors",
+    "Dressed": "dressing.dress",
+    "DressingError": "errors",
     "Garment": "objects.garment",
     "GarmentMotion": "objects.motion",
     "LayersNet": "nn.layers.network",
@@ -89,6 +95,7 @@ _HOME = {
     "Verdict": "objects.status",
     "Wind": "objects.wind",
     "browse": "view.browser.page",
+    "dress": "dressing.dress",
     "fit": "objects.fit",
     "read_body": "objects.body",
 }

@@ -28,6 +28,10 @@ class MissingExtra(ImportError):
         super().__init__(f'{purpose} needs an optional package: pip install "warpgarment[{extra}]"')
 
 
+class DressingError(ValueError):
+    """A garment that cannot be put on a body: says why, in figures, and what to do."""
+
+
 class UsageError(ValueError):
     """Options that parse but do not fit each other or the files they name."""
 

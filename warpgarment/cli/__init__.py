@@ -56,6 +56,9 @@ VERBS = {
     "simulate": Verb(
         "cli.simulate", "Simulate", "run", "Dress a moving body: garment files, body motion, output file."
     ),
+    "dress": Verb(
+        "cli.dress", "Dress", "run", "Put a garment of another body, pose or unit on the first frame of a body."
+    ),
     "generate": Verb(
         "training.generate.run", "GenerateConfig", "generate", "Simulate training sequences with a physics teacher."
     ),

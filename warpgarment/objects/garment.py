@@ -234,6 +234,30 @@ class Garment:
         whole._joined = self, went[finite]
         return whole
 
+    def transformed(self, matrix: Any, shift: Any = (0.0, 0.0, 0.0)) -> Garment:
+        """The garment at another place, in another size, or turned; seams that are joined stay so.
+
+        Args:
+            matrix: Rotation times scale, [3,3]; a point p goes to matrix @ p + shift.
+            shift: [m], [3].
+
+        Raises:
+            MeshError: As of the constructor, such as where the garment becomes too small for float32.
+        """
+        linear, offset = np.asarray(matrix, np.float64), np.asarray(shift, np.float64)
+        if not np.linalg.det(linear) > 0:
+            raise MeshError("matrix mirrors the garment or flattens it. Give a rotation times a positive scale.")
+        moved = checked_positions(self.vertices.astype(np.float64) @ linear.T + offset)
+        if self._joined is None:
+            other = type(self)(moved, self.faces, pins=self.pins, name=self.name, surface=self.surface)
+        else:
+            garment, went = self._joined
+            other = type(self).__new__(type(self))
+            other.vertices, other.faces, other.pins, other.name = moved, self.faces, self.pins, self.name
+            other.surface, other._joined = self.surface, (garment.transformed(linear, offset), went)
+        other.source = self.source
+        return other
+
     def cleaned(self, *, keep: bool = False) -> Garment:
         """A cleaned copy: joins open borders at the same place, such as the two sides of a seam; see `cleaned_from`."""
         told: dict[str, Any] = {"pins": self.pins, "name": self.name, "surface": self.surface}

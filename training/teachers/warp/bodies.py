@@ -3,28 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from warpgarment.kernels.collision.body_contacts import contacts
+from warpgarment.kernels.physics.planes import Planes, planes_of
 from warpgarment.kernels.sdf import BodyMeshes
 from warpgarment.training.teachers import ClothScene
 from warpgarment.training.teachers.scenes import bound_to_body, used_body
-
-
-class Planes(NamedTuple):
-    """Planes that vertices keep away from."""
-
-    normal: torch.Tensor
-    """Unit normals, float64 [V,3]; zero for none."""
-    offset: torch.Tensor
-    """Places along the normals [m], float64 [V]."""
-    distance: torch.Tensor
-    """Distances to keep [m], float64 [V]."""
-    way: torch.Tensor
-    """Motion of the surface during the step [m], float64 [V,3]."""
 
 
 class MovingBodies:
@@ -63,7 +49,6 @@ class MovingBodies:
         face_starts = np.cumsum([0] + [len(found[n][1]) for n in with_body])
         ends = [int(starts[n]) for n in with_body] + [int(starts[-1])]
         self._meshes = BodyMeshes(self._after, torch.from_numpy(faces).to(device), ends, [int(n) for n in face_starts])
-        self._faces = self._meshes.faces.long()
         self._body_of_vertex = torch.from_numpy(body[scene_of_vertex]).to(device)
         self._keep = torch.from_numpy(keep.astype(np.float32)).to(device)
         self._within = self._keep + gap
@@ -83,28 +68,7 @@ class MovingBodies:
         """Planes of points [m], float64 [V,3], at a share of the frame; `step` is the share that the step takes."""
         now, before = self._between(share), self._between(share - step)
         self._meshes.update(now)
-        guess = points.float()
-        query = self._meshes.query(guess, self._body_of_vertex, within=self._within)
-        found = contacts(
-            guess,
-            query.distance,
-            query.face,
-            self._meshes,
-            self._within,
-            body_of_vertex=self._body_of_vertex,
-        )
-        assert isinstance(found.distance, torch.Tensor)
-        distance = torch.minimum(self._keep, found.distance).double()
-        corner = self._faces[query.face.clamp(min=0).long()]
-        weights = _barycentric(query.closest.double(), now[corner].double())
-        way = (weights[:, :, None] * (now - before)[corner]).sum(1)
-        there = (found.normal != 0).any(1)
-        return Planes(
-            found.normal,
-            (found.normal * found.anchor).sum(1),
-            torch.where(there, distance, 0.0),
-            torch.where(there[:, None], way, 0.0),
-        )
+        return planes_of(points, self._meshes, before, self._keep, self._within, self._body_of_vertex)
 
     def pins(self, share: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Vertices that are tied to bodies, [P], and their positions [m] at a share of the frame, float64 [P,3]."""
@@ -113,16 +77,6 @@ class MovingBodies:
         normal = torch.linalg.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
         normal = normal / normal.norm(dim=1, keepdim=True).clamp(min=1e-30)
         return pin, (weights[:, :, None] * points).sum(1) + height[:, None] * normal
-
-
-def _barycentric(point: torch.Tensor, corner: torch.Tensor) -> torch.Tensor:
-    """Barycentric coordinates of points [V,3] in the planes of triangles [V,3,3]; a third each where there is none."""
-    a, b, p = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0], point - corner[:, 0]
-    aa, ab, bb, pa, pb = ((x * y).sum(1) for x, y in ((a, a), (a, b), (b, b), (p, a), (p, b)))
-    size = aa * bb - ab * ab
-    second, third = (bb * pa - ab * pb) / size, (aa * pb - ab * pa) / size
-    weights = torch.stack([1.0 - second - third, second, third], 1)
-    return torch.where(weights.isfinite().all(1, keepdim=True), weights, 1.0 / 3.0)
 
 
 def _bound_pins(

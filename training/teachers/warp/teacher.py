@@ -15,12 +15,13 @@ import warp as wp
 from warpgarment.errors import UsageError
 from warpgarment.kernels.launch import as_warp, torch_stream
 from warpgarment.kernels.physics import ImplicitSolver, PhysicsCloth, Sheet
+from warpgarment.kernels.physics.planes import pressed, touch
 from warpgarment.kernels.wind import add_air_forces
 from warpgarment.training.teachers import ClothScene, Moving
 from warpgarment.training.teachers.scenes import check_scenes, side_by_side, start_of
 
-from .bodies import MovingBodies, Planes
-from .meeting import Meeting
+from .bodies import MovingBodies
+from .meeting import meeting_of
 from .settings import WarpSettings
 
 
@@ -87,7 +88,7 @@ class WarpTeacher:
         bodies = MovingBodies(scenes, scene_of_vertex, keep, options.contact_gap, device)
         first = np.concatenate([c.first for scene in scenes for c in scene.cloths])
         points = torch.from_numpy(first).to(device).double()
-        meeting = Meeting(scenes, cloth.faces, points, options.self_margin) if options.self_contact else None
+        meeting = meeting_of(scenes, cloth.faces, points, options.self_margin) if options.self_contact else None
         solver = ImplicitSolver(
             cloth,
             inertia=(1.0 if options.scheme == "euler" else 2.25) / step**2,
@@ -144,18 +145,6 @@ class WarpTeacher:
             if frame >= settle:
                 at, going = (t.float().cpu().numpy() for t in (motion.points, motion.velocity))
                 yield [Moving(at[a:b], going[a:b]) for a, b in itertools.pairwise(starts)]
-
-
-def touch(solver: ImplicitSolver, planes: Planes) -> None:
-    """Gives the solver planes to keep away from."""
-    for name in ("normal", "offset", "distance"):
-        getattr(solver, name).copy_(getattr(planes, name))
-
-
-def pressed(solver: ImplicitSolver, points: torch.Tensor) -> torch.Tensor:
-    """Force with which planes of the last solve push each vertex [N], float64 [V]."""
-    gap = solver.distance - ((solver.normal * points).sum(1) - solver.offset)
-    return torch.where((solver.normal != 0).any(1), gap.clamp(min=0.0), 0.0) * solver.contact
 
 
 class _Motion:

@@ -1,0 +1,41 @@
+"""A picture of a dressed body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warpgarment.objects.body import BodyMotion
+from warpgarment.view import draw
+
+from .dress import Dressed
+
+SIDES = ((20.0, "front"), (110.0, "side"), (200.0, "back"))
+SIZE = (360, 520)
+
+
+def draw_dressed(path: str | Path, dressed: Dressed, body: BodyMotion) -> np.ndarray:
+    """Writes a PNG of the garment on the body's first frame from three sides; pins are drawn in another colour.
+
+    Args:
+        path: File to write.
+        dressed: The garment.
+        body: The body.
+
+    Returns:
+        sRGB picture, uint8 [H,W,3].
+    """
+    at, garment = body.vertices[0], dressed.garment
+    tied = np.isin(garment.faces, garment.pins).any(axis=1)
+    surfaces = [draw.Surface(at, body.faces), draw.Surface(dressed.vertices, garment.faces[~tied], draw.CORAL, True)]
+    if tied.any():
+        surfaces.append(draw.Surface(dressed.vertices, garment.faces[tied], draw.TEAL, True))
+    seen = np.concatenate([at, dressed.vertices])
+    pictures = [
+        draw.caption(draw.render(surfaces, draw.Camera.framing(seen, size=SIZE, azimuth=azimuth), size=SIZE), name)
+        for azimuth, name in SIDES
+    ]
+    picture = np.concatenate(pictures, axis=1)
+    draw.write_png(path, picture)
+    return picture
