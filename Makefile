@@ -1,6 +1,7 @@
 # make demo    installs the package in .venv and rolls out the bundled garments (out/demo/)
 # make test    installs what the tests need and runs them
 # make lint    ruff, and .ci/check_tree.py: types, directions of imports, folders, files
+# make docs    builds the documentation in build/site, strictly, and checks its links
 # make bench   times a rollout by stage on this machine
 # make gpu     on a machine with a GPU: what it computes beside a CPU, then all benchmarks
 #
@@ -18,7 +19,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 # torch is installed first and by itself; left in, its line would contradict another TORCH
 CONSTRAINTS := $(VENV)/constraints.txt
 
-.PHONY: demo test lint bench gpu clean
+.PHONY: demo test lint docs bench gpu clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.demo
@@ -31,6 +32,10 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python .ci/check_tree.py
+
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --clean
+	$(BIN)/python .ci/check_site.py build/site
 
 bench: $(VENV)/.demo
 	$(BIN)/warpgarment bench $(if $(DEVICE),--device $(DEVICE))
@@ -50,6 +55,10 @@ $(VENV)/.torch: constraints.txt
 
 $(VENV)/.demo: $(VENV)/.torch pyproject.toml
 	$(PIP) -c $(CONSTRAINTS) -e '.[usd,view]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.torch pyproject.toml
+	$(PIP) -c $(CONSTRAINTS) -e '.[docs]'
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.torch pyproject.toml
