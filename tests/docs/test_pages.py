@@ -24,7 +24,7 @@ PAGES += ["training/README.md", "benchmarks/README.md", "findings/README.md"]
 PAGES += [f"warpgarment/assets/weights/{path.name}" for path in sorted(wg.demo.ASSETS.parent.glob("weights/*.md"))]
 LONG = {  # pages whose commands take long, and say so in the words of SENTENCE
     *("training/README.md", "docs/materials.md", "docs/layersnet.md", "docs/physics.md"),
-    *("docs/rounding.md", "docs/hostile_files.md", "benchmarks/README.md", "findings/README.md", "docs/batches.md"),
+    *("docs/rounding.md", "docs/hostile_files.md", "benchmarks/README.md", "findings/README.md"),
 }
 SENTENCE = "Commands on this page take long: tests read their options and do not run them."
 RUN = {"docs/extending.md": "tests/test_extending_*.py carry out all of it"}
@@ -32,6 +32,8 @@ NOT_RUN = {  # blocks of Python that say so in their first line, by what that li
     ("docs/readers.md", "# not run by the tests: needs a sample of CLOTH3D and a body model"),
     ("docs/readers.md", "# not run by the tests: needs the SMPL model files"),
     ("docs/layersnet.md", "# not run by the tests: no weights ship"),
+    ("docs/bodies.md", "# not run by the tests: making Anny's body takes two minutes"),
+    ("docs/viewer.md", "# not run by the tests: waits for Ctrl+C"),
 }
 CARDS = "warpgarment/assets/weights/"  # whose commands are those that made the networks
 RUNS_ON = {  # verbs that run on one page, and of which the options are read on all others
@@ -81,7 +83,8 @@ def _try(words: list[str], page: str, where: str, capsys) -> None:
     if len(words) < 2 or words[1] not in pages.cli.VERBS:
         assert words[1:] in (["--help"], ["VERB", "--help"]), where
         return None
-    if page in LONG or page.startswith(CARDS) or RUNS_ON.get(words[1], page) != page:
+    serves = "--browser" in words  # until it is stopped: tests/view runs it
+    if serves or page in LONG or page.startswith(CARDS) or RUNS_ON.get(words[1], page) != page:
         return pages.read_options(words)
     status = pages.run(words)
     assert status in (0, 3), f"{where}: exit status {status}: {capsys.readouterr().err}"

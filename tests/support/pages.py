@@ -71,10 +71,11 @@ def run(words: list[str]) -> int:
 
 
 def read_options(words: list[str]) -> None:
-    """Reads the options of `warpgarment VERB ...`, or of a module that is started like it, without running it."""
+    """Reads the options of `warpgarment VERB ...` without running it; three dots stand for options of training."""
     verb = cli.VERBS[words[1]]
     config = getattr(importlib.import_module(f"warpgarment.{verb.module}"), verb.options)
-    tyro.cli(config, prog=words[1], args=[word for word in words[2:] if word != "..."])
+    given = [part for word in words[2:] for part in (["--steps", "1"] if word == "..." else [word])]
+    tyro.cli(config, prog=words[1], args=given)
 
 
 def check(words: list[str]) -> None:

@@ -12,9 +12,22 @@ import numpy as np
 
 import warpgarment as wg
 from support import sequences
+from support.bodies import write_bvh
 from warpgarment.io.usd import write_usd
 
 FRAMES = 6
+SKELETON = [
+    *(("Hips", None, (0, 0, 0)), ("Spine", "Hips", (0, 20, 0)), ("Head", "Spine", (0, 40, 0))),
+    *(
+        joint
+        for side, x in (("Left", 1), ("Right", -1))
+        for joint in (
+            *((f"{side}UpLeg", "Hips", (9 * x, 0, 0)), (f"{side}Leg", f"{side}UpLeg", (0, -40, 0))),
+            *((f"{side}Foot", f"{side}Leg", (0, -40, 0)), (f"{side}Arm", "Spine", (15 * x, 30, 0))),
+            *((f"{side}ForeArm", f"{side}Arm", (28 * x, 0, 0)), (f"{side}Hand", f"{side}ForeArm", (28 * x, 0, 0))),
+        )
+    ),
+]
 
 
 @functools.cache
@@ -59,10 +72,13 @@ def write(folder: Path) -> None:
     (folder / "gusts.csv").write_text("0, 0, -1\n0, 0, -3\n0, 0, -6\n")
     job = {"garment": "inner.obj", "body": "walk.npz", "out": "out/job.npz"}
     (folder / "jobs.jsonl").write_text(json.dumps(job) + "\n")
+    write_bvh(folder / "walk.bvh", SKELETON, [[0.0, 80.0, float(t), *[0.0] * 45] for t in range(FRAMES)])
     for name in ("clips", "CLIPS"):  # of which names and number are looked at
         (folder / name).mkdir()
         (folder / name / "walk.bvh").touch()
-    sequences.write_set(folder / "sequences", train=2, validation=1, test=1, frames=16)
+    for number, split in enumerate(("train", "train", "validation", "test")):
+        named = {"motion": f"sway {split}"}
+        sequences.write(folder / "sequences", f"{split}_{number}", split, seed=number, frames=16, manifest=named)
 
 
 def names(folder: Path) -> dict[str, Any]:
