@@ -15,7 +15,7 @@ from urllib.parse import unquote, urlsplit
 
 FETCHED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src"), ("source", "src"), ("video", "src")}
 OF_STYLE = re.compile(r"""url\(\s*['"]?([a-z]+:)?//|@import\s+['"](?:[a-z]+:)?//""")
-UNRENDERED = re.compile(r"\\\(|\\\[|class=\"arithmatex\"|<merror")
+UNRENDERED = re.compile(r"\\\(|\\\[|class=\"arithmatex\"|<m\w+>\\\w*")
 
 
 class Seen(HTMLParser):
