@@ -1,7 +1,7 @@
 """Every block of README.md and of the documentation is tried.
 
 Blocks of Python run one after the other in a namespace of their page, on the first six frames of the bundled walk
-(`support/stage.py`). Commands of `warpgarment` run in this process, with the small numbers of `support/pages.SMALLER`.
+(`support/documentation/stage.py`). Commands of `warpgarment` run in this process, with the small numbers of `SMALLER`.
 On the pages of `LONG`, which say so, and for verbs that `RUNS_ON` another page, their options are read instead.
 Pages of `RUN` are carried out by the tests named there. Other commands are checked for what they name: targets of make,
 extras, modules, scripts.
@@ -15,7 +15,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from support import pages, stage
+from support.documentation import pages, stage
 
 import warpgarment as wg
 
@@ -44,7 +44,7 @@ RUNS_ON = {  # verbs that run on one page, and of which the options are read on 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> Path:
-    """The files of `support/stage.py`."""
+    """The files of `support/documentation/stage.py`."""
     folder = tmp_path_factory.mktemp("stage")
     stage.write(folder)
     return folder

@@ -7,7 +7,7 @@ from pathlib import Path
 import nbformat
 import pytest
 from PIL import Image
-from support import stage
+from support.documentation import stage
 
 import warpgarment as wg
 

@@ -15,7 +15,7 @@ from markdown_it import MarkdownIt
 
 from warpgarment import cli
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SHELL = ("sh", "bash", "")
 SMALLER = {  # what is added to a command, by its verb, so that it takes seconds
     "demo": "--frames 3 --moments 2 --no-film",
