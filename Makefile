@@ -2,6 +2,7 @@
 # make test    installs what the tests need and runs them
 # make dist    builds sdist and wheel (dist/), and runs the demo from the wheel in an empty environment
 # make lint    ruff, and .ci/check_tree.py: types, directions of imports, folders, files
+# make docs    builds the documentation in build/site, strictly, and checks its links
 # make bench   times a rollout by stage on this machine
 # make gpu     on a machine with a GPU: what it computes beside a CPU, then all benchmarks
 #
@@ -19,7 +20,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 # torch is installed first and by itself; left in, its line would contradict another TORCH
 CONSTRAINTS := $(VENV)/constraints.txt
 
-.PHONY: demo test dist lint bench gpu clean
+.PHONY: demo test dist lint docs bench gpu clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.demo
@@ -35,6 +36,10 @@ lint: $(VENV)/.test
 
 dist: $(VENV)/.test
 	$(BIN)/python .ci/check_dist.py dist
+
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --clean
+	$(BIN)/python .ci/check_site.py build/site
 
 bench: $(VENV)/.demo
 	$(BIN)/warpgarment bench $(if $(DEVICE),--device $(DEVICE))
@@ -54,6 +59,10 @@ $(VENV)/.torch: constraints.txt
 
 $(VENV)/.demo: $(VENV)/.torch pyproject.toml
 	$(PIP) -c $(CONSTRAINTS) -e '.[usd,view]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.torch pyproject.toml
+	$(PIP) -c $(CONSTRAINTS) -e '.[docs]'
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.torch pyproject.toml

@@ -43,7 +43,9 @@ def main(out: Path = Path("out/batch"), frames: int = 60) -> None:
         )
     for index, motion in enumerate(together):
         motion.save(out / f"{index}_{motion.name}.pc2")
-    print(f"wrote {len(together)} motions to {out}")
+    rows = [(f"{m.name} on body {k}", [m], [wg.draw.PALETTE[k]]) for k, m in enumerate(together)]
+    wg.draw.sheet(out / "batch.png", None, rows, frames=6)
+    print(f"wrote {len(together)} motions and batch.png to {out}")
 
 
 if __name__ == "__main__":

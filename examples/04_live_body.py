@@ -38,7 +38,9 @@ def main(out: Path = Path("out/live"), frames: int = 60) -> None:
     print(f"{len(shown)} frames on {simulator.device}: {median:.0f} ms in the median, {slowest:.0f} ms at most")
     motion = wg.GarmentMotion(np.stack(shown), shirt.garment.faces, fps=30.0, name="tshirt")
     motion.save(out / "tshirt.npz")
-    print(f"wrote {out}/tshirt.npz")
+    seen = wg.BodyMotion(assets.body.vertices[: motion.frames], assets.body.faces, assets.body.fps)
+    wg.draw.contact_sheet(out / "tshirt.png", seen, [motion], frames=6)
+    print(f"wrote {out}/tshirt.npz and {out}/tshirt.png")
 
 
 if __name__ == "__main__":

@@ -62,6 +62,9 @@ def main(out: Path = Path("out/own_training"), frames: int = 60, steps: int = 60
     motion = simulator.rollout(
         dress.garment, assets.collider, first_vertices=dress.first_vertices, frames=min(frames, 20)
     )
+    body = wg.BodyMotion(assets.body.vertices[: motion.frames], assets.body.faces, assets.body.fps)
+    truth = wg.GarmentMotion(dress.truth.vertices[: motion.frames], dress.truth.faces, dress.truth.fps)
+    wg.draw.contact_sheet(out / "dress.png", body, [motion], [truth], frames=6)
     error = wg.metrics.mean_vertex_error(motion.vertices, dress.truth.vertices[: motion.frames])
     print(f"{path}: {error:.2f} cm from the truth after {motion.frames} frames")
 

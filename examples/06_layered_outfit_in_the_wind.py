@@ -11,7 +11,7 @@ import tyro
 import warpgarment as wg
 
 
-def main(out: Path = Path("out/outfit"), frames: int = 90, weights: str = "default") -> None:
+def main(out: Path = Path("out/outfit"), frames: int = 90, weights: str = "layers") -> None:
     assets = wg.demo.assets()
     dress, jacket = assets.outfit.outfit
     outfit = wg.Outfit([dress, jacket], materials=[wg.Material.cotton(), wg.Material.denim()])  # innermost first

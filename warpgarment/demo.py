@@ -23,6 +23,7 @@ from warpgarment.objects.material import Material
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.outfit import Outfit
 from warpgarment.objects.wind import Wind
+from warpgarment.view.progress import counted
 from warpgarment.view.report import rollout_table
 
 from . import metrics
@@ -210,7 +211,9 @@ def run(
         # On a CPU only every second frame is drawn: drawing all of them would take longer than the simulation.
         step = 2 if simulator.device.type == "cpu" else 1
         panels = [*zip(motions.values(), truth, strict=True)]
-        pictures = _film(body, panels, layers, range(0, body.frames, step), brush)
+        filmed = range(0, body.frames, step)
+        drawn = _film(body, panels, layers, filmed, brush)
+        pictures = counted(drawn, "drawing", unit="frame", total=len(filmed), shown=progress)
         draw.write_mp4(out / "demo.mp4", pictures, body.fps / step)
     print(rollout_table(motions, timings, errors))
     if worn:

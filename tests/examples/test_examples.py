@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.outfits import layersnet
 from support.runs import entries_of
 
@@ -78,7 +79,7 @@ def test_train_on_own_data(tmp_path, capsys) -> None:
 
 def test_layered_outfit_in_the_wind(tmp_path, capsys) -> None:
     """Layers of the example cross, or are not counted; or a network that reads wind gets none: another motion."""
-    _run("06_layered_outfit_in_the_wind", out=tmp_path / "still", frames=4)
+    _run("06_layered_outfit_in_the_wind", out=tmp_path / "still", frames=4, weights="fast")
     printed = capsys.readouterr().out
     assert "this network reads neither materials nor wind" in printed
     for name in ("dress", "jacket"):
@@ -118,3 +119,12 @@ def test_newton_humanoid(tmp_path, capsys) -> None:
     assert {f"{what}_{world}.usd" for what in ("dress", "humanoid") for world in (0, 1)} <= {
         path.name for path in tmp_path.iterdir()
     }
+
+
+def test_a_hundred_garments(tmp_path, capsys) -> None:
+    """Garments that were cut are no garments, or go into the body: deeper than 5 mm in the last of three frames."""
+    _run("07_a_hundred_garments", out=tmp_path, count=5, frames=3)
+    printed = capsys.readouterr().out
+    assert "5 garments" in printed
+    assert float(printed.split(" mm deep at most")[0].split()[-1]) < 5
+    assert min(Image.open(tmp_path / "hundred.png").size) > 200

@@ -13,6 +13,7 @@ import numpy as np
 from warpgarment.errors import MissingExtra
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.view import draw
+from warpgarment.view.progress import counted
 
 from .sequence import Sequence as SequenceOnDisk
 
@@ -31,7 +32,8 @@ def contact_sheet(
         size: Width and height of a picture in pixels.
         samples: Number of samples per pixel in each direction.
     """
-    panels = [_panel(SequenceOnDisk.load(folder), k, size, samples) for k, folder in enumerate(folders)]
+    shown = counted(folders, "drawing", unit="sequence")
+    panels = [_panel(SequenceOnDisk.load(folder), k, size, samples) for k, folder in enumerate(shown)]
     columns = min(columns, len(panels))
     blank = np.full_like(panels[0], 255)
     panels += [blank] * (-len(panels) % columns)

@@ -19,6 +19,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.plain import open_plain
+from warpgarment.view.progress import counted
 from warpgarment.view.report import table
 
 from .layout import SPLITS
@@ -116,7 +117,8 @@ def verify(root: str | Path) -> Report:
         raise FileNotFoundError(f"no data set at {root}")
     report = Report(root.resolve().name)
     entries = []
-    for path in sorted(p for p in root.iterdir() if p.is_dir() and p.name not in NOT_SEQUENCES):
+    folders = sorted(p for p in root.iterdir() if p.is_dir() and p.name not in NOT_SEQUENCES)
+    for path in counted(folders, "checking", unit="sequence"):
         if path.name.startswith("."):
             report.problems.append(Problem(path.name, "unfinished. Remove it, unless a sequence is being written."))
         else:

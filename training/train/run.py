@@ -317,7 +317,10 @@ class Run:
         self.recent.clear()
         self.figures = self.rate.take()
         entry = dict(zip(self.names, means, strict=True))
-        bar.set_postfix_str(f"loss {entry['loss']:.3f}, {spelt(self.figures)}", refresh=False)
+        left = (
+            "" if self.config.time_limit is None else f", {self.config.time_limit - self.elapsed() / 60:.0f} min left"
+        )
+        bar.set_postfix_str(f"loss {entry['loss']:.3f}, {spelt(self.figures)}{left}", refresh=False)
         entry["lr"] = self.optimizer.param_groups[0]["lr"]
         self.log.write(self.step, self.elapsed(), entry | self.figures)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -50,7 +51,8 @@ def run(options: Bench) -> None:
         simulator.rollout(garments, assets.collider, frames=3, **arguments)
         simulator.timings.clear()
         began = time.perf_counter()
-        simulator.rollout(garments, assets.collider, frames=frames, **arguments)
+        shown = sys.stderr.isatty()
+        simulator.rollout(garments, assets.collider, frames=frames, progress=shown, **arguments)
         elapsed = time.perf_counter() - began
         columns.append({**simulator.timings, "all, with set-up": elapsed})
     scale = 1e3 / (frames - 1)

@@ -17,6 +17,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 from warpgarment.objects.wind import Wind
+from warpgarment.view.progress import counted
 
 from . import spoken
 from .outdoors import check_read, materials_of, wind_of
@@ -212,7 +213,8 @@ def _fitted(garments: list[Garment], shot: Shot, body: Load, where: str) -> list
     given = {"shape": shot.body_shape} if bones else {"shape": None, "rest": False}
     rest = _body(shot.fit_rest, shot, body, where, collider=False, mesh=None, **{"rest": True, **given})
     rest_body, first_body = (rest.vertices[0], rest.faces), (whole.vertices[0], whole.faces)
-    return [fit(garment, rest_body, first_body) for garment in garments]
+    each = counted(garments, "fitting", unit="garment", total=len(garments))
+    return [fit(garment, rest_body, first_body) for garment in each]
 
 
 def _body(path: Path, shot: Shot, body: Load, where: str, **more: Any) -> BodyMotion:

@@ -16,6 +16,7 @@ from warpgarment.objects.clock import in_words
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.view import draw
 from warpgarment.view.matched import Motion, matched
+from warpgarment.view.progress import counted
 
 from . import spoken
 from .outputs import check_output
@@ -107,7 +108,8 @@ def run(options: View) -> None:
     if options.out.suffix.lower() == ".mp4":
         camera = draw.chase(scene, size=options.size, azimuth=options.azimuth)
         pictures = draw.film(body, garments, size=options.size, camera=camera)
-        draw.write_mp4(options.out, pictures, garments[0].fps)
+        drawn = counted(pictures, "drawing", unit="frame", total=garments[0].frames)
+        draw.write_mp4(options.out, drawn, garments[0].fps)
     else:
         panel = (options.size[0] // 2, options.size[1] // 2)
         camera = draw.chase(scene, size=panel, azimuth=options.azimuth)

@@ -1,0 +1,1 @@
+"""The documentation as tests see it: blocks of pages, and the files that they speak of."""
