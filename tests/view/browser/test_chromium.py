@@ -21,6 +21,18 @@ BUTTONS = "[...document.querySelectorAll('button')].map(e => e.textContent.trim(
 TIME = r"(document.body.innerText.match(/frame (\d+), /) || [])[1]"
 
 
+CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton')"
+SCENE = 660  # pixels: the panel is to the right
+
+
+def _settled(browser: Chromium) -> None:
+    """Waits until the scene is drawn, and closes the note that it is drawn without a graphics card."""
+    browser.rest(2.0)
+    browser.run(f"{CLOSE}.forEach(e => e.click())")
+    browser.until(f"{CLOSE}.length === 0", 60)
+    browser.rest(1.0)
+
+
 def _garment(picture: np.ndarray) -> np.ndarray:
     """Pixels of the coral of the first garment, in any light: much more red than green and blue."""
     r, g, b = picture.astype(int).transpose(2, 0, 1)
@@ -47,11 +59,11 @@ def test_a_dressed_body_is_seen_and_plays(tmp_path: Path) -> None:
     assets = wg.demo.assets()
     motion = assets.garments["dress"].truth
     (tmp_path / "profile").mkdir()
-    with wg.browse(motion, assets.body, port=0) as page, Chromium(tmp_path / "profile", (800, 560)) as browser:
+    with wg.browse(motion, assets.body, port=0) as page, Chromium(tmp_path / "profile", (1000, 560)) as browser:
         browser.open(page.url)
         browser.until(f"{BUTTONS}.includes('Play')", 300)
         browser.until(TIME, 120)
-        browser.rest(2.0)
+        _settled(browser)
         first = browser.picture(_saved(tmp_path, "first.png"))
         dress, skin = _garment(first), _body(first)
         assert dress.mean() > 0.01
@@ -88,7 +100,7 @@ def test_a_dressed_body_is_seen_and_plays(tmp_path: Path) -> None:
 def test_colors_and_a_second_result(tmp_path: Path) -> None:
     """Colours would be plain, or the second result lie in the first: one by stretch has several colours, two are wide.
 
-    At least four colours of the scale cover 20 pixels each, to 40 in each channel, in the light of the page.
+    Blue faces, shorter than at rest, and red ones, longer, cover 50 pixels each; of the coral, less than 30 % is left.
     """
     assets = wg.demo.assets()
     motion = assets.garments["tshirt"].truth
@@ -96,26 +108,20 @@ def test_colors_and_a_second_result(tmp_path: Path) -> None:
     other = wg.GarmentMotion(motion.vertices, motion.faces, motion.fps, name="other")
     (tmp_path / "profile").mkdir()
     page = wg.browse(motion, assets.body, beside=other, rest=[garment.vertices], port=0)
-    with page, Chromium(tmp_path / "profile", (800, 560)) as browser:
+    with page, Chromium(tmp_path / "profile", (1000, 560)) as browser:
         browser.open(page.url)
         browser.until(TIME, 300)
-        browser.rest(2.0)
+        _settled(browser)
         plain = browser.picture(_saved(tmp_path, "beside.png"))
-        parts = np.split(np.flatnonzero(_garment(plain).sum(0) > 5), np.flatnonzero(np.diff(np.flatnonzero(
-            _garment(plain).sum(0) > 5)) > 8) + 1)  # fmt: skip
+        columns = np.flatnonzero(_garment(plain).sum(0) > 5)
+        parts = np.split(columns, np.flatnonzero(np.diff(columns) > 8) + 1)
         assert sum(len(part) > 20 for part in parts) == 2, "two shirts, with a gap"
         page.panel.color.value = "stretch against rest"
         browser.until("document.body.innerText.includes('largest stretch')", 120)
         browser.rest(3.0)
         colored = browser.picture(_saved(tmp_path, "stretch.png"))
         assert _garment(colored).sum() < 0.3 * _garment(plain).sum()
-        hues = _hues(colored[:, : colored.shape[1] // 2])
-        assert hues["blue"] > 20
-        assert hues["red"] > 20
+        r, _, b = colored[:, :SCENE].astype(int).transpose(2, 0, 1)
+        assert (b - r > 25).sum() > 50, "no face is shorter than at rest"
+        assert (r - b > 60).sum() > 50, "no face is longer than at rest"
         assert not browser.errors
-
-
-def _hues(picture: np.ndarray) -> dict[str, int]:
-    """Pixels that are more blue than red, and the other way round, outside the panel's own blue."""
-    r, _, b = picture.astype(int).transpose(2, 0, 1)
-    return {"blue": int((b - r > 25).sum()), "red": int((r - b > 50).sum())}

@@ -17,7 +17,7 @@ from warpgarment.view.browser import reruns
 from warpgarment.view.browser.stage import DISTANCE, ERROR, PLAIN, STRAIN
 
 pytest.importorskip("viser", reason='the page needs viser: pip install "warpgarment[browser]"')
-from support.pages.visitor import Visitor
+from benchmarks.viewer.visitor import Visitor
 
 FRAMES = 30
 OVERHEAD = 4_000  # bytes of names, colours, the slider and the time, of a frame

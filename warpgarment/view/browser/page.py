@@ -166,6 +166,7 @@ class Browser:
             self.server = viser.ViserServer(host=host, port=port, label=TITLE, verbose=False)
         self.url = f"http://{_reached(host)}:{self.server.get_port()}"
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
+        self.server.gui.main_panel.dock_right()  # beside the scene, not over it
         self._arrange(self.server, sides)
         shift = centres(sides[0])
         self.stage = Stage(self.server, sides, shift, self._turns)
@@ -209,7 +210,7 @@ class Browser:
         """Y up, a floor, and a camera that sees the first frame."""
         points = np.concatenate([part.frames[0] + np.float32([side.x, 0, 0]) for side in sides for part in side.parts])
         points = points[np.isfinite(points).all(axis=1)]
-        camera = draw.Camera.framing(points, size=(900, 800)) if len(points) else draw.Camera((0.0, 1.0, 0.0), 4.0)
+        camera = draw.Camera.framing(points, size=(800, 800)) if len(points) else draw.Camera((0.0, 1.0, 0.0), 4.0)
         server.scene.set_up_direction("+y")
         server.scene.configure_environment_map(None)  # colours as they are, and quick without a graphics card
         server.scene.configure_default_lights(cast_shadow=False)
