@@ -22,7 +22,7 @@ from pathlib import Path
 
 PACKAGES = {"warpgarment": "warpgarment", "kernels": "warpgarment/kernels", "training": "warpgarment/training"}
 OTHERS = ("LICENSE", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "constraints.txt", "pyproject.toml")
-NOT_IN_ALL = {"all", "dev"}  # extras that `all` leaves out
+NOT_IN_ALL = {"all", "dev", "docs"}  # extras that `all` leaves out
 BUILD = "import sys; from setuptools import build_meta as b; print(getattr(b, 'build_' + sys.argv[1])(sys.argv[2]))"
 
 

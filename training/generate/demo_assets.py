@@ -1,7 +1,9 @@
 """Makes the bundled assets for demo and tests: a body, its walk, and two garments simulated on it.
 
     python -m warpgarment.training.generate.demo_assets OUT
+    python -m warpgarment.training.generate.demo_assets OUT KEPT    # with the garments and the body in the folder KEPT
 
+The second form simulates the meshes that ship again: a newer cutter or remesher makes others of the same patterns.
 All data come from this package's own code and Anny; no motion capture is used. OUT/rest_body.npz holds the body in its
 rest pose, OUT/body.npz its motion (with hands and forearms marked as no collider), and OUT/<garment>.npz rest_vertices,
 faces, pins and `truth`, the simulated vertices.
@@ -16,6 +18,8 @@ import numpy as np
 
 from warpgarment.bodies.anny import anny_bodies
 from warpgarment.bodies.skeleton import arms_abducted, blended_in, facing_forward, posed
+from warpgarment.geometry.skinning import linear_blend_skinning
+from warpgarment.objects.garment import Garment
 from warpgarment.training.garments.make import make_garment
 from warpgarment.training.garments.pattern import Pattern
 from warpgarment.training.motions.procedural import procedural
@@ -32,13 +36,32 @@ PATTERNS = {
 }
 
 
-def make(out: Path, device: str = "cpu") -> None:
+def make(out: Path, kept: Path | None = None, device: str = "cpu") -> None:
     """Writes the assets into a folder.
+
+    Args:
+        out: The folder.
+        kept: Folder of such assets, whose body, motion and garments are simulated again; None makes new ones.
+        device: Warp device of the teacher.
 
     Raises:
         RuntimeError: A garment did not pass the quality gate.
     """
     out.mkdir(parents=True, exist_ok=True)
+    if kept is not None:
+        with np.load(kept / "body.npz") as held:
+            skin = {name: held[name] for name in ("rest_vertices", "bone_indices", "bone_weights", "bone_transforms")}
+            faces = held["faces"][held["collider_faces"]]
+        frames = linear_blend_skinning(*skin.values())
+        for name in PATTERNS:
+            with np.load(kept / f"{name}.npz") as held:
+                garment = Garment(held["rest_vertices"], held["faces"], pins=held["pins"], name=name)
+            corners = garment.vertices[garment.faces].astype(np.float64)
+            across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            area = 0.5 * np.linalg.norm(across, axis=1).mean()
+            edge = float(np.sqrt(4.0 / np.sqrt(3.0) * area))
+            _simulate(out, name, garment, edge, skin["bone_transforms"][0, 0], frames, faces, device)
+        return
     body = anny_bodies().rest(**PHENOTYPE)
     poses = arms_abducted(body, procedural(body, "walk", FRAMES, seed=SEED, fps=FPS), 15.0)
     poses = blended_in(body, facing_forward(poses), BLEND)
@@ -55,27 +78,41 @@ def make(out: Path, device: str = "cpu") -> None:
         collider_faces=collider,
         fps=FPS,
     )
-    first = transforms[0, 0].astype(np.float64)
     for name, pattern in PATTERNS.items():
         garment, edge = make_garment(body, pattern)
-        placed = (garment.vertices @ first[:, :3].T + first[:, 3]).astype(np.float32)
-        gate = QualityGate((garment,), body.faces[collider])
-        truth = []
-        scene = ClothScene((Cloth(garment, edge, placed),), frames, body.faces[collider], fps=FPS)
-        for frame, vertices in enumerate(NewtonTeacher(device=device).simulate(scene)):
-            reason = gate.check(frame, vertices, frames[frame])
-            if reason:
-                raise RuntimeError(f"{name}: {reason}")
-            truth.append(vertices)
-        np.savez_compressed(
-            out / f"{name}.npz",
-            rest_vertices=garment.vertices,
-            faces=garment.faces,
-            pins=garment.pins,
-            truth=np.stack(truth),
-        )
-        print(name, len(garment.faces), "faces", {k: round(v, 4) for k, v in gate.figures(len(truth)).items()})
+        _simulate(out, name, garment, edge, transforms[0, 0], frames, body.faces[collider], device)
+
+
+def _simulate(
+    out: Path,
+    name: str,
+    garment: Garment,
+    edge: float,
+    first: np.ndarray,
+    frames: np.ndarray,
+    faces: np.ndarray,
+    device: str,
+) -> None:
+    """Writes one garment and its simulation; `first` [3,4] is the rigid motion from the rest pose to frame 0."""
+    first = first.astype(np.float64)
+    placed = (garment.vertices @ first[:, :3].T + first[:, 3]).astype(np.float32)
+    gate = QualityGate((garment,), faces)
+    truth = []
+    scene = ClothScene((Cloth(garment, edge, placed),), frames, faces, fps=FPS)
+    for frame, vertices in enumerate(NewtonTeacher(device=device).simulate(scene)):
+        reason = gate.check(frame, vertices, frames[frame])
+        if reason:
+            raise RuntimeError(f"{name}: {reason}")
+        truth.append(vertices)
+    np.savez_compressed(
+        out / f"{name}.npz",
+        rest_vertices=garment.vertices,
+        faces=garment.faces,
+        pins=garment.pins,
+        truth=np.stack(truth),
+    )
+    print(name, len(garment.faces), "faces", {k: round(v, 4) for k, v in gate.figures(len(truth)).items()})
 
 
 if __name__ == "__main__":
-    make(Path(sys.argv[1]))
+    make(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)
