@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -51,6 +52,7 @@ def on_cluster(
 
     started = not ray.is_initialized()
     if started:
+        os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")  # of a busy machine; 60 by default
         ray.init(address=address, include_dashboard=False if address == "local" else None, log_to_driver=False)
 
     @ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=1)

@@ -19,7 +19,7 @@ from support.documentation import pages, stage
 
 import warpgarment as wg
 
-PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((pages.ROOT / "docs").glob("*.md")))]
+PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((pages.ROOT / "docs").glob("*.md")))]
 PAGES += ["training/README.md", "benchmarks/README.md", "findings/README.md"]
 PAGES += [f"warpgarment/assets/weights/{path.name}" for path in sorted(wg.demo.ASSETS.parent.glob("weights/*.md"))]
 LONG = {  # pages whose commands take long, and say so in the words of SENTENCE
