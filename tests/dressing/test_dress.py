@@ -9,9 +9,9 @@ import ipctk
 import numpy as np
 import pytest
 from support import scenes
-from support.patterns import boxy_tshirt
 
 import warpgarment as wg
+from benchmarks.dressing.patterns import boxy_tshirt
 from warpgarment import cli
 from warpgarment.dressing.measure import unworn
 from warpgarment.dressing.openings import roles_of
