@@ -71,7 +71,7 @@ def measured(
 
     def crosses(points: np.ndarray, faces: np.ndarray, garment: int) -> bool:
         mesh = ipctk.CollisionMesh(points, ipctk.edges(faces), faces)
-        mesh.can_collide = lambda a, b: a < garment or b < garment  # the body may cross itself
+        mesh.can_collide = ipctk.make_static_obstacle_filter(garment)  # the body may cross itself
         return bool(ipctk.has_intersections(mesh, points))
 
     both = np.concatenate([points.astype(float), body.astype(float)])
