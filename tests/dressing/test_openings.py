@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import meshes, scenes
-from support.patterns import boxy_trousers, boxy_tshirt
 
 import warpgarment as wg
+from benchmarks.dressing.patterns import boxy_trousers, boxy_tshirt
 from warpgarment.dressing.openings import openings_of, roles_of
 
 TURNS = [[0, 0, 0], [np.pi / 2, 0, 0], [0.3, 1.2, -0.4]]

@@ -47,6 +47,8 @@ class Dress:
     """Axis that points up in the body's file; by default Y, or what the file says."""
     body_mesh: str | None = None
     """Name of the mesh where the body's file holds several."""
+    body_shape: str | None = None
+    """Body that a file of a skeleton's motion (.bvh, AMASS) moves, as `simulate --body-shape`."""
     scale: str | None = None
     """Change of size beyond the unit: a number, or fit for the one with which the openings are as wide as usual."""
     turn: float | None = None
@@ -79,9 +81,10 @@ def run(options: Dress) -> int:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*the garment would be .* m in size")  # the report says it
             garment = Garment.load(options.garment, clean=options.clean, mesh=options.garment_mesh)
-    with spoken(mesh="--body-mesh", unit="--body-unit", up="--body-up", fps="--body-fps"):
+    with spoken(mesh="--body-mesh", unit="--body-unit", up="--body-up", fps="--body-fps", shape="--body-shape"):
         warnings.filterwarnings("ignore", message=".*the file has no rate")  # one frame has none
-        body = BodyMotion.load(options.body, unit=options.body_unit, up=options.body_up, mesh=options.body_mesh)
+        told = {"unit": options.body_unit, "up": options.body_up, "mesh": options.body_mesh}
+        body = BodyMotion.load(options.body, **told, shape=options.body_shape)
     with spoken(**names, turn="--turn", pins="--pins", place="--keep-place"):
         try:
             dressed = dress(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,6 +75,9 @@ class Shot:
     fit_rest: Path | None = None
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame. Of a
     .bvh or AMASS motion, BODY itself included, this is its body at rest."""
+    dress: bool = False
+    """Put the garment on the body's first frame before, as `warpgarment dress` does: it may have been modelled on
+    another body, in another pose, place or unit."""
     frames: int | None = None
     """Simulate only the first so many frames."""
     out_fps: float | Literal["body", "network"] = "body"
@@ -130,6 +134,11 @@ def checked(
     outputs = {} if shot.out is None else outputs_of(shot.out, pieces, (*shot.files, shot.fit_rest))
     if isinstance(shot.out_fps, float) and not 0 < shot.out_fps < math.inf:
         raise UsageError(f"--out-fps {shot.out_fps:g}: a positive number of frames a second, body or network.")
+    if shot.dress and (len(pieces) > 1 or shot.fit_rest is not None):
+        what = "with --fit-rest" if shot.fit_rest is not None else f"of {len(pieces)} garments"
+        raise UsageError(
+            f"--dress {what}: it puts one garment on the body. Dress each with `warpgarment dress` before."
+        )
     known = materials_of(shot.material if materials is None else materials, len(pieces))
     wind = wind_of(shot.wind, shot.wind_file, shot.wind_fps, 30.0)
     return Checked(shot, pieces, outputs, known, wind is not None, pins)
@@ -199,7 +208,22 @@ def loaded(known: Checked, garment: Load = Garment.load, body: Load = BodyMotion
         }
     moving = _body(shot.files[-1], shot, body, where)
     wind = wind_of(shot.wind, shot.wind_file, shot.wind_fps, moving.fps)
+    if shot.dress:
+        garments, first = _dressed(garments, moving, where)
+        return Loaded(known, garments, moving, first, wind)
     return Loaded(known, garments, moving, _fitted(list(garments.values()), shot, body, where), wind)
+
+
+def _dressed(garments: dict[str, Garment], body: BodyMotion, where: str) -> tuple[dict[str, Garment], list[Any]]:
+    """Garments on the first frame of a body, and their first positions; what was guessed is said."""
+    from warpgarment.dressing.dress import dress
+
+    worn = {name: dress(garment, body) for name, garment in garments.items()}
+    with spoken(where, scale="--scale", unit="--unit", up="--up"):
+        for name, one in worn.items():
+            for words in (*one.report.notes, *one.report.faults):
+                warnings.warn(f"{name}: {words}", UserWarning, stacklevel=1)
+    return {name: one.garment for name, one in worn.items()}, [one.vertices for one in worn.values()]
 
 
 def _fitted(garments: list[Garment], shot: Shot, body: Load, where: str) -> list[Any] | None:

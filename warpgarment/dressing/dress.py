@@ -20,6 +20,7 @@ import numpy as np
 from warpgarment.errors import DressingError, MeshError
 from warpgarment.geometry.checks import checked_faces, checked_positions
 from warpgarment.geometry.orientation import turned_outward
+from warpgarment.geometry.seams import coinciding_borders
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.clearance import clearance
 from warpgarment.objects.garment import Garment
@@ -119,13 +120,17 @@ def dress(
     cloth = garment.simulated.garment
     source = garment.source
     told = Told() if source is None else Told(source.metres, source.metres_from, source.up, source.up_from)
+    seams = coinciding_borders(cloth.vertices, cloth.faces).sides
+    if seams:
+        raise DressingError(
+            f"the garment is not sewn: {seams:,} vertices of open borders lie where others do. Load it with clean=True."
+        )
     roles = roles_of(cloth.vertices, cloth.faces)
     rest = cloth.vertices.astype(np.float64)
     where = placed(rest, roles, at, faces, limbs, told, unit=unit, up=up, scale=scale, turn=turn, move=place)
-    worn = garment.transformed(where.scale * where.rotation, where.shift)
     notes = list(where.notes)
     held, pins_from = find_pins(garment, roles, pins)
-    worn.pins = held
+    worn = garment.transformed(where.scale * where.rotation, where.shift, pins=held)
     if not len(held) and roles.kind in ("trousers", "tube"):
         notes.append('nothing holds its waist but friction: give pins="waist" if it has a waistband.')
     cloth = worn.simulated.garment

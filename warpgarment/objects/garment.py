@@ -234,12 +234,13 @@ class Garment:
         whole._joined = self, went[finite]
         return whole
 
-    def transformed(self, matrix: Any, shift: Any = (0.0, 0.0, 0.0)) -> Garment:
+    def transformed(self, matrix: Any, shift: Any = (0.0, 0.0, 0.0), *, pins: Any = None) -> Garment:
         """The garment at another place, in another size, or turned; seams that are joined stay so.
 
         Args:
             matrix: Rotation times scale, [3,3]; a point p goes to matrix @ p + shift.
             shift: [m], [3].
+            pins: Vertices to tie to the body's surface, integers, shape [P]; None for those that it has.
 
         Raises:
             MeshError: As of the constructor, such as where the garment becomes too small for float32.
@@ -248,13 +249,16 @@ class Garment:
         if not np.linalg.det(linear) > 0:
             raise MeshError("matrix mirrors the garment or flattens it. Give a rotation times a positive scale.")
         moved = checked_positions(self.vertices.astype(np.float64) @ linear.T + offset)
+        held = self.pins if pins is None else checked_pins(pins, len(moved))
         if self._joined is None:
-            other = type(self)(moved, self.faces, pins=self.pins, name=self.name, surface=self.surface)
+            other = type(self)(moved, self.faces, pins=held, name=self.name, surface=self.surface)
         else:
             garment, went = self._joined
             other = type(self).__new__(type(self))
-            other.vertices, other.faces, other.pins, other.name = moved, self.faces, self.pins, self.name
-            other.surface, other._joined = self.surface, (garment.transformed(linear, offset), went)
+            other.vertices, other.faces, other.pins, other.name = moved, self.faces, held, self.name
+            joined = went[held]
+            other._joined = garment.transformed(linear, offset, pins=joined[joined >= 0]), went
+            other.surface = self.surface
         other.source = self.source
         return other
 

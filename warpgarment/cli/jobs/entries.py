@@ -238,6 +238,7 @@ _KEYS: dict[str, Callable[[str, Any], Any]] = {
     "body_shape": _text,
     "clean": _flag,
     "fit_rest": _text,
+    "dress": _flag,
     "frames": _count,
     "out_fps": _rate,
 }
