@@ -74,7 +74,8 @@ def read_options(words: list[str]) -> None:
     """Reads the options of `warpgarment VERB ...` without running it; three dots stand for options of training."""
     verb = cli.VERBS[words[1]]
     config = getattr(importlib.import_module(f"warpgarment.{verb.module}"), verb.options)
-    given = [part for word in words[2:] for part in (["--steps", "1"] if word == "..." else [word])]
+    dots = ["--steps", "1"] if words[1] == "train" else []
+    given = [part for word in words[2:] for part in (dots if word == "..." else [word])]
     tyro.cli(config, prog=words[1], args=given)
 
 
