@@ -16,6 +16,7 @@ import torch
 from warpgarment.errors import UsageError
 from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
+from warpgarment.kernels.threads import torch_on_one
 from warpgarment.nn import checkpoint
 from warpgarment.nn.device import device_of
 from warpgarment.nn.network import GarmentNetwork
@@ -393,7 +394,10 @@ class Simulator:
         self, state: SimulationState[Vertices, Status], next_body: torch.Tensor, wind: torch.Tensor | None
     ) -> SimulationState[Vertices, Status]:
         scene, now = state.scene, state.now.blown(wind)
-        if state.graph is None or self.timings.synchronise:
+        if self.device.type == "cpu":
+            with torch_on_one():
+                after = advance(scene, now, next_body)
+        elif state.graph is None or self.timings.synchronise:
             after = advance(scene, now, next_body)
         else:
             after = state.graph(now, next_body)
