@@ -53,7 +53,9 @@ def measured(builds: Builds, options: argparse.Namespace, folder: Path) -> Itera
             yield _same_state(builds, case)
         elif case.fresh:
             rounds, given = min(options.rounds, case.rounds), scenes(case.options, folder)
-            yield _row(case, _in_turns(builds, case, lambda python, case=case, given=given: fresh(python, case, given), rounds))
+            yield _row(
+                case, _in_turns(builds, case, lambda python, case=case, given=given: fresh(python, case, given), rounds)
+            )
         else:
             yield _row(case, _with_workers(builds, case, options, folder))
 
@@ -98,7 +100,13 @@ def _same_state(builds: Builds, case: Case) -> Row:
         float(np.linalg.norm(np.subtract(one[2], other[2]), axis=1).max() * 1e3)
         for one, other in zip(*answers, strict=True)
     ]
-    row = {"what": case.what, "unit": "mm", "states": len(apart), "most": max(apart), "median": statistics.median(apart)}
+    row = {
+        "what": case.what,
+        "unit": "mm",
+        "states": len(apart),
+        "most": max(apart),
+        "median": statistics.median(apart),
+    }
     return row | {"target": SAME, "met": max(apart) <= SAME}
 
 

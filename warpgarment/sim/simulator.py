@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, overload
 
 import numpy as np
@@ -183,7 +184,7 @@ class Simulator:
         frame, which holds NaN, with a status that says so and a RuntimeWarning.
 
         On a CPU the result is repeated bit for bit, and is that of each garment alone if it has more than 512 faces.
-        It may depend on the number of threads in the last bit, which can grow to a millimetre: docs/rounding.md.
+        Networks other than those of patches may differ with the threads, up to a millimetre: docs/rounding.md.
 
         Args:
             garment: One garment, a list, an `Outfit`, or a list of outfits.
@@ -394,11 +395,6 @@ class Simulator:
         self, state: SimulationState[Vertices, Status], next_body: torch.Tensor, wind: torch.Tensor | None
     ) -> SimulationState[Vertices, Status]:
         scene, now = state.scene, state.now.blown(wind)
-        if self.device.type == "cpu":
-            with torch_on_one():
-                after = advance(scene, now, next_body)
-        elif state.graph is None or self.timings.synchronise:
-            after = advance(scene, now, next_body)
-        else:
-            after = state.graph(now, next_body)
-        return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
+        run = state.graph if state.graph and not self.timings.synchronise else partial(advance, scene)
+        with torch_on_one():
+            return SimulationState(scene, state.single, state.frame + 1, run(now, next_body), state.graph)
