@@ -85,7 +85,7 @@ def _override(network: GarmentNetwork, wanted: NetworkConfig, names: Iterable[st
     network.config = dataclasses.replace(network.config, **free)
     for name in names:
         has, wants = getattr(network.config, name, None), getattr(wanted, name)
-        more = name == "outdoor" and set(wants) <= set(has)  # channels are added to those that there are
+        more = name == "outdoor" and set(wants) <= set(has or ())  # channels are added to those that there are
         if has != wants and not more and name != "dropout":  # of which the default of the overrides speaks, too
             raise UsageError(
                 f"overrides: {name}={wants}, but the network from init has {has}, and its weights depend on it. Leave "

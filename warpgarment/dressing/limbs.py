@@ -181,7 +181,8 @@ def _limb(points: np.ndarray, used: np.ndarray, tip: int, reach: np.ndarray, hei
     ring = np.full(len(points), -1)
     finite = used[np.isfinite(reach[used])]
     ring[finite] = (reach[finite] / band).astype(int)
-    lines, radii = [], []
+    lines: list[np.ndarray] = []
+    radii: list[float] = []
     narrowest = np.inf
     for k in range(RINGS):
         mine = points[ring == k]

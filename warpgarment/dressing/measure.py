@@ -55,8 +55,8 @@ def _crossings(points: np.ndarray, faces: np.ndarray, garment: np.ndarray, itsel
 def depth_of(points: torch.Tensor, edges: np.ndarray, faces: np.ndarray, bodies: BodyMeshes) -> SurfaceDepth:
     """Depth of vertices, edges and faces in the body [m], see `SurfaceDepth`."""
     owner = torch.zeros(len(points), dtype=torch.int32)
-    integers = [torch.from_numpy(np.ascontiguousarray(a, np.int32)) for a in (edges, faces)]
-    return surface_depth(points.float().contiguous(), bodies, owner, *integers, owner, 1)
+    lines, triangles = (torch.from_numpy(np.ascontiguousarray(a, np.int32)) for a in (edges, faces))
+    return surface_depth(points.float().contiguous(), bodies, owner, lines, triangles, owner, 1)
 
 
 def stretch_of(points: np.ndarray, rest: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -182,7 +182,8 @@ def line_from(vertices: np.ndarray, faces: np.ndarray, opening: Opening, longest
 
 def _pairs(points: np.ndarray, found: list[Opening]) -> tuple[list[tuple[Opening, Opening]], list[Opening]]:
     """Pairs of openings, two at most, and what is left."""
-    rest, pairs = list(found), []
+    rest = list(found)
+    pairs: list[tuple[Opening, Opening]] = []
     while len(rest) >= 3 and len(pairs) < 2:
         faults = {(a, b): _fault(points, rest, a, b) for a, b in itertools.combinations(range(len(rest)), 2)}
         (a, b), least = min(faults.items(), key=lambda item: item[1])

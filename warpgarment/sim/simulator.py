@@ -394,8 +394,8 @@ class Simulator:
     def _advance(
         self, state: SimulationState[Vertices, Status], next_body: torch.Tensor, wind: torch.Tensor | None
     ) -> SimulationState[Vertices, Status]:
-        scene, now = state.scene, state.now.blown(wind)
-        graph = None if self.timings.synchronise else state.graph
+        scene, now, graph = state.scene, state.now.blown(wind), state.graph
         with torch_on_one():
-            after = advance(scene, now, next_body) if graph is None else graph(now, next_body)
+            plain = graph is None or self.timings.synchronise
+            after = advance(scene, now, next_body) if plain else graph(now, next_body)  # type: ignore[misc]
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)

@@ -12,7 +12,7 @@ gets the same bits with any number of threads and in any batch. Operators are th
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 import torch.nn.functional as F
@@ -85,7 +85,7 @@ def forward(
     heard = faces.new_empty((rows, patches, width))
     answer = faces.new_empty((rows, count, network.face_head.out_features))
     velocities: list[torch.Tensor] = [tokens] * rows
-    layers = list(network.after)
+    layers = [cast("FaceLayer", layer) for layer in network.after]
 
     def of(values: torch.Tensor, row: int) -> torch.Tensor:
         return values[row % len(values)]

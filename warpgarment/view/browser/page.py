@@ -208,7 +208,9 @@ class Browser:
 
     def _arrange(self, server: viser.ViserServer, sides: list[Side]) -> None:
         """Y up, a floor, and a camera that sees the first frame."""
-        points = np.concatenate([part.frames[0] + np.float32([side.x, 0, 0]) for side in sides for part in side.parts])
+        points = np.concatenate(
+            [part.frames[0] + np.array([side.x, 0, 0], np.float32) for side in sides for part in side.parts]
+        )
         points = points[np.isfinite(points).all(axis=1)]
         camera = draw.Camera.framing(points, size=(800, 800)) if len(points) else draw.Camera((0.0, 1.0, 0.0), 4.0)
         server.scene.set_up_direction("+y")

@@ -30,11 +30,16 @@ class Live(Protocol):
         wind: The wind as it is at first, or None.
     """
 
-    garments: Sequence[Garment]
-    body: BodyMotion
-    reads: Collection[str]
-    materials: Sequence[Material | None]
-    wind: Wind | None
+    @property
+    def garments(self) -> Sequence[Garment]: ...
+    @property
+    def body(self) -> BodyMotion: ...
+    @property
+    def reads(self) -> Collection[str]: ...
+    @property
+    def materials(self) -> Sequence[Material | None]: ...
+    @property
+    def wind(self) -> Wind | None: ...
 
     def run(self, materials: Sequence[Material | None], wind: Wind | None) -> Iterator[list[np.ndarray]]:
         """Positions of each garment [m], [V,3], frame by frame."""
