@@ -394,8 +394,7 @@ class Simulator:
     def _advance(
         self, state: SimulationState[Vertices, Status], next_body: torch.Tensor, wind: torch.Tensor | None
     ) -> SimulationState[Vertices, Status]:
-        scene, now, graph = state.scene, state.now.blown(wind), state.graph
+        scene, now, graph = state.scene, state.now.blown(wind), None if self.timings.synchronise else state.graph
         with torch_on_one():
-            plain = graph is None or self.timings.synchronise
-            after = advance(scene, now, next_body) if plain else graph(now, next_body)  # type: ignore[misc]
+            after = advance(scene, now, next_body) if graph is None else graph(now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
