@@ -7,7 +7,7 @@ import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -83,7 +83,7 @@ def run(options: Dress) -> int:
             garment = Garment.load(options.garment, clean=options.clean, mesh=options.garment_mesh)
     with spoken(mesh="--body-mesh", unit="--body-unit", up="--body-up", fps="--body-fps", shape="--body-shape"):
         warnings.filterwarnings("ignore", message=".*the file has no rate")  # one frame has none
-        told = {"unit": options.body_unit, "up": options.body_up, "mesh": options.body_mesh}
+        told: dict[str, Any] = {"unit": options.body_unit, "up": options.body_up, "mesh": options.body_mesh}
         body = BodyMotion.load(options.body, **told, shape=options.body_shape)
     with spoken(**names, turn="--turn", pins="--pins", place="--keep-place"):
         try:
