@@ -68,7 +68,9 @@ def main() -> None:
     with wg.browse(live, assets.body, port=0) as page, Visitor(page.url):
         assert page.reruns is not None
         until(lambda: page.reruns.run is not None and page.reruns.run.done)
-        print(f"\n| run | first frame after [s] | {FRAMES} frames after [s] | ms a frame |\n| --- | ---: | ---: | ---: |")
+        print(
+            f"\n| run | first frame after [s] | {FRAMES} frames after [s] | ms a frame |\n| --- | ---: | ---: | ---: |"
+        )
         for speed in (4.0, 10.0):
             old = page.reruns.run
             page.ask(Settings(tuple(live.materials), Wind([0, 0, -1], speed)))
