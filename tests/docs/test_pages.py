@@ -39,7 +39,12 @@ NOT_RUN = {  # blocks of Python that say so in their first line, by what that li
 CARDS = "warpgarment/assets/weights/"  # whose commands are those that made the networks
 RUNS_ON = {  # verbs that run on one page, and of which the options are read on all others
     **dict.fromkeys(("generate", "train", "evaluate", "dataset"), "docs/own_data.md"),
-    **{"bench": "docs/live.md", "doctor": "docs/troubleshooting.md", "demo": "tests/test_demo.py"},
+    **{
+        "dress": "docs/dressing.md",
+        "bench": "docs/live.md",
+        "doctor": "docs/troubleshooting.md",
+        "demo": "tests/test_demo.py",
+    },
 }
 
 

@@ -146,5 +146,6 @@ def test_simulate_dresses_before(tmp_path, collider, capsys) -> None:
     assert "mm is assumed" in capsys.readouterr().err
     first = BodyMotion.load(out)
     assert _depth(first.vertices[0], first.faces, collider) < 2e-3
-    assert cli.main(list(map(str, ["simulate", skirt, skirt, body, "--dress", "--out", out]))) == 2
+    several = tmp_path / "{name}.npz"
+    assert cli.main(list(map(str, ["simulate", skirt, skirt, body, "--dress", "--out", several]))) == 2
     assert "of 2 garments" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support import scenes
+from support.dressed import write_panels
 
 import warpgarment as wg
 from warpgarment.dressing.openings import roles_of
@@ -58,3 +59,19 @@ def test_pins_that_are_not_there_are_refused(wanted) -> None:
     garment = _skirt("band")
     with pytest.raises(wg.DressingError, match="it has band, rest, body, cloth"):
         find_pins(garment, roles_of(garment.vertices, garment.faces), wanted)
+
+
+def test_seams_stay_joined_and_pinned_where_a_garment_is_moved(tmp_path) -> None:
+    """The seams of a garment would open, or its pins be lost, once it is moved. Positions to 1e-5 m, by hand; a mirror
+    is refused."""
+    garment = wg.Garment.load(write_panels(tmp_path / "panels.obj"), clean=True)
+    moved = garment.transformed(2.0 * np.eye(3), [1.0, 0.0, 0.0], pins=[0])
+    simulated = moved.simulated
+    assert len(simulated.garment.vertices) < len(moved.vertices)
+    wanted = 2.0 * garment.vertices + np.float32([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(moved.vertices, wanted, atol=1e-5)
+    np.testing.assert_allclose(simulated.restored(simulated.garment.vertices), wanted, atol=1e-5)
+    assert len(simulated.garment.pins) == 1
+    np.testing.assert_allclose(simulated.garment.vertices[simulated.garment.pins[0]], wanted[0], atol=1e-5)
+    with pytest.raises(wg.MeshError, match="mirrors"):
+        garment.transformed(np.diag([1.0, 1.0, -1.0]))
