@@ -38,7 +38,7 @@ dist: $(VENV)/.test
 	$(BIN)/python .ci/check_dist.py dist
 
 docs: $(VENV)/.docs
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --clean
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 	$(BIN)/python .ci/check_site.py build/site
 
 bench: $(VENV)/.demo

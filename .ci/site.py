@@ -26,6 +26,7 @@ OUTSIDE = {  # folders and files of the repository, and where they are in the si
     "benchmarks/results": "benchmarks/results",
     "findings/README.md": "findings/README.md",
     "warpgarment/assets/weights": "weights",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
     "CHANGELOG.md": "CHANGELOG.md",
 }
 KINDS = (".md", ".png")

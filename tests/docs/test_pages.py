@@ -35,6 +35,7 @@ NOT_RUN = {  # blocks of Python that say so in their first line, by what that li
     ("docs/layersnet.md", "# not run by the tests: no weights ship"),
     ("docs/bodies.md", "# not run by the tests: making Anny's body takes two minutes"),
     ("docs/viewer.md", "# not run by the tests: waits for Ctrl+C"),
+    ("docs/dressing.md", "# not run by the tests: needs your files; tests/dressing runs wg.dress"),
 }
 CARDS = "warpgarment/assets/weights/"  # whose commands are those that made the networks
 RUNS_ON = {  # verbs that run on one page, and of which the options are read on all others
@@ -89,8 +90,8 @@ def _try(words: list[str], page: str, where: str, capsys) -> None:
     if len(words) < 2 or words[1] not in pages.cli.VERBS:
         assert words[1:] in (["--help"], ["VERB", "--help"]), where
         return None
-    serves = "--browser" in words  # until it is stopped: tests/view runs it
-    if serves or page in LONG or page.startswith(CARDS) or RUNS_ON.get(words[1], page) != page:
+    apart = {"--browser", "--dress"} & set(words)  # a server until it is stopped, a minute: tests/view, tests/dressing
+    if apart or page in LONG or page.startswith(CARDS) or RUNS_ON.get(words[1], page) != page:
         return pages.read_options(words)
     status = pages.run(words)
     assert status in (0, 3), f"{where}: exit status {status}: {capsys.readouterr().err}"

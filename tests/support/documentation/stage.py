@@ -60,6 +60,9 @@ def write(folder: Path) -> None:
     ):
         _obj(folder / f"{name}.obj", first, garment.faces)
     bundle.body.save(folder / "walk.npz")
+    bundle.body.save(folder / "dance.npz")
+    worn = bundle.outfit.outfit.garments[0]
+    wg.Garment(bundle.outfit.first_vertices[0], worn.faces, name="worn").save(folder / "worn.npz")
     bundle.body.save(folder / "walk.pc2")
     wg.GarmentMotion(dress.truth.vertices, dress.garment.faces, 30.0, name="draped").save(folder / "draped.pc2")
     _obj(folder / "draped.obj", dress.garment.vertices, dress.garment.faces)
