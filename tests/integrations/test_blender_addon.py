@@ -101,7 +101,7 @@ bpy.context.view_layer.objects.active = garment
 RUN = """
 from warpgarment_blender import task as tasks, ui
 
-longest, words = [], []
+longest, words, tasks.BUDGET = [], [], 0.0  # a frame for each step
 step = tasks.Task.step
 def timed(self):
     if self._process is not None and self._process.poll() is not None:

@@ -81,7 +81,7 @@ class Task:
 
     def _read(self) -> None:
         end = time.monotonic() + BUDGET
-        more = True
+        more = self._reader.read()
         while more and time.monotonic() < end:
             more = self._reader.read()
         count = len(self._reader.frames)
