@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import copy
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import torch
 import warp as wp
+
+from . import threads
 
 if wp.config.log_level == wp.LOG_INFO:  # the user's own setting stays; Warp's default prints at every module load
     wp.config.log_level = wp.LOG_WARNING
@@ -83,6 +86,48 @@ def descriptor(tensor: torch.Tensor, dtype: type) -> object:
         cached._ref = None  # otherwise the memory would be kept as long as the descriptor
         _descriptors[key] = cached
     return cached
+
+
+PER_THREAD = 3  # ranges of a launch for each thread: rows near a body take longer than others
+
+
+def launch_rows(
+    kernel: wp.Kernel,
+    rows: int,
+    inputs: Sequence[object],
+    outputs: Sequence[object],
+    device: wp.Device,
+    *,
+    least: int = 256,
+) -> None:
+    """Launches a kernel over rows that are independent of each other, on a CPU in ranges on several threads.
+
+    A row writes to its own memory only, without atomics, so the result does not depend on the ranges.
+
+    Args:
+        kernel: Kernel whose first parameter is the first row of a launch: `i = from_row + wp.tid()`.
+        rows: Number of rows.
+        inputs: Arguments after the first.
+        outputs: Arguments after `inputs`.
+        device: Warp's device.
+        least: Number of rows that are worth the 0.1 ms that another range takes.
+    """
+    if not rows:
+        return
+    parts = min(PER_THREAD * threads.count(), rows // least) if device.is_cpu and threads.count() > 1 else 1
+    if parts < 2:
+        wp.launch(kernel, dim=rows, inputs=[0, *inputs], outputs=outputs, device=device)
+        return
+    recorded = wp.launch(kernel, dim=rows, inputs=[0, *inputs], outputs=outputs, device=device, record_cmd=True)
+    commands = []
+    for part in range(parts):
+        begin, end = rows * part // parts, rows * (part + 1) // parts
+        command = copy.copy(recorded)
+        command.params, command.fwd_args = list(recorded.params), list(recorded.fwd_args)
+        command.set_dim(end - begin)
+        command.set_param_at_index(0, begin)
+        commands.append(command.launch)
+    threads.spread(commands)
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.closest import Bodies
@@ -56,6 +56,8 @@ def half_of_the_room(mesh: wp.uint64, point: wp.vec3, outward: wp.vec3, distance
 
 @wp.kernel(enable_backward=False)
 def find_contacts(
+    # Range:
+    from_row: wp.int32,
     # Body:
     bodies: Bodies,
     # In:
@@ -74,7 +76,7 @@ def find_contacts(
 
     The closest point is computed again in float64: in float32, a direction over 0.1 mm has three digits.
     """
-    i = wp.tid()
+    i = from_row + wp.tid()
     n = wp.vec3d()
     u = wp.vec3d()
     keep = epsilon[wp.min(i, epsilon.shape[0] - 1)]
@@ -155,9 +157,9 @@ def contacts(
     closest, normal = allocate((2, len(vertices), 3), torch.float64, device)
     kept = allocate((len(vertices),), torch.float32, device)
     with torch_stream(device) as warp_device:
-        wp.launch(
+        launch_rows(
             find_contacts,
-            dim=len(vertices),
+            len(vertices),
             inputs=[
                 bodies.model,
                 as_argument(vertices, wp.vec3),
@@ -170,6 +172,7 @@ def contacts(
                 as_argument(normal, wp.vec3d),
                 as_argument(kept, wp.float32),
             ],
+            outputs=[],
             device=warp_device,
         )
     return Contacts(normal, closest, kept)

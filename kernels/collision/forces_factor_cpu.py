@@ -24,7 +24,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
@@ -34,6 +34,8 @@ from warpgarment.kernels.operator import allocate
 
 @wp.kernel(enable_backward=False)
 def contact_forces(
+    # Range:
+    from_row: wp.int32,
     # Model:
     start: wp.array[wp.int32],
     rows: wp.array[wp.int32],
@@ -68,7 +70,7 @@ def contact_forces(
     error: wp.array[wp.float64],
 ):
     """Forces and displacements of one component, a thread; those without a factor are left as they are."""
-    component = wp.tid()
+    component = from_row + wp.tid()
     b = base[component]
     if b >= 0:
         begin = start[component]
@@ -201,9 +203,9 @@ def solve(
     scalars, vectors = allocate((4, places), torch.float64, device), allocate((2, places, 4), torch.float64, device)
     force = torch.zeros(len(normal), dtype=torch.float64, device=device)
     with torch_stream(device) as warp_device:
-        wp.launch(
+        launch_rows(
             contact_forces,
-            dim=len(factor.base),
+            len(factor.base),
             inputs=[
                 as_argument(system.start, wp.int32),
                 as_argument(system.rows, wp.int32),
@@ -222,6 +224,8 @@ def solve(
                 as_argument(report, wp.int32),
                 as_argument(error, wp.float64),
             ],
+            outputs=[],
             device=warp_device,
+            least=1,
         )
     return force

@@ -18,7 +18,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.operator import allocate
@@ -31,6 +31,8 @@ wp.set_module_options({"max_unroll": 1})  # unrolled loops over sixteen would co
 
 @wp.kernel(enable_backward=False)
 def wide_contacts(
+    # Range:
+    from_row: wp.int32,
     # Model:
     start: wp.array[wp.int32],
     rows: wp.array[wp.int32],
@@ -62,7 +64,7 @@ def wide_contacts(
     error: wp.array[wp.float64],
 ):
     """Forces and displacements of one component; those without a compliance matrix are left as they are."""
-    component = wp.tid()
+    component = from_row + wp.tid()
     if base[component] >= wp.int64(0):
         first = start[component]
         size = start[component + 1] - first
@@ -211,9 +213,9 @@ def solve(
         return as_argument(tensor.view(-1, 16), vec16)
 
     with torch_stream(device) as warp_device:
-        wp.launch(
+        launch_rows(
             wide_contacts,
-            dim=len(model.base),
+            len(model.base),
             inputs=[
                 as_argument(system.start, wp.int32),
                 as_argument(system.rows, wp.int32),
@@ -236,6 +238,8 @@ def solve(
                 as_argument(report, wp.int32),
                 as_argument(error, wp.float64),
             ],
+            outputs=[],
             device=warp_device,
+            least=1,
         )
     return force

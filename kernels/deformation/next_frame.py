@@ -18,7 +18,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, expect, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .svd import svd
@@ -44,6 +44,8 @@ def broken_garments_kernel(
 
 @wp.kernel(enable_backward=False)
 def next_gradients_kernel(
+    # Range:
+    from_row: wp.int32,
     # Model:
     garment_of_face: wp.array[wp.int32],
     replace: wp.bool,
@@ -56,7 +58,7 @@ def next_gradients_kernel(
     # Out:
     target: wp.array[wp.mat33],
 ):
-    i = wp.tid()
+    i = from_row + wp.tid()
     phi = wp.mat33d()
     for row in range(3):
         for column in range(3):
@@ -127,9 +129,9 @@ def next_gradients(
                 outputs=[marked],
                 device=warp_device,
             )
-            wp.launch(
+            launch_rows(
                 next_gradients_kernel,
-                dim=rows,
+                rows,
                 inputs=[owner, replace, smallest, as_argument(features, wp.float32), gradients, values, marked],
                 outputs=[as_argument(target, wp.mat33)],
                 device=warp_device,

@@ -39,8 +39,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import expect
-from warpgarment.kernels.operator import row_operator
+from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
+from warpgarment.kernels.operator import allocate, row_operator
 
 MAX_GAIN = wp.constant(wp.float64(100.0))
 """Largest factor by which the gradient of replace_singular_values may amplify one mode of its argument."""
@@ -280,16 +280,17 @@ def replace_singular_values_kernel(
 
 @wp.kernel(enable_backward=False)
 def rotation_kernel(
+    # Range:
+    from_row: wp.int32,
     # In:
     phi: wp.array[wp.mat33],
     # Out:
     turn: wp.array[wp.mat33],
 ):
-    i = wp.tid()
+    i = from_row + wp.tid()
     turn[i] = wp.mat33(rotation_of(wp.mat33d(phi[i])))
 
 
-_rotation = row_operator("rotation", rotation_kernel, {"phi": wp.mat33}, {"turn": (wp.mat33, (3, 3))}, rows="phi")
 _singular_values = row_operator(
     "singular_values",
     singular_values_kernel,
@@ -352,4 +353,10 @@ def rotation(phi: torch.Tensor) -> torch.Tensor:
     expect("phi", phi, (None, 3, 3))
     if phi.requires_grad and torch.is_grad_enabled():
         return _replace_singular_values(phi, phi.new_ones(phi.shape[:2]))
-    return _rotation(phi)
+    phi = phi.detach()
+    turn = allocate(phi.shape, torch.float32, phi.device)
+    with torch_stream(phi.device) as device:
+        launch_rows(
+            rotation_kernel, len(phi), [as_argument(phi, wp.mat33)], [as_argument(turn, wp.mat33)], device, least=1024
+        )
+    return turn

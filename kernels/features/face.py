@@ -28,7 +28,7 @@ import warp as wp
 
 from warpgarment.kernels.deformation.gradients import corners_exist, expect_mesh, face_frame
 from warpgarment.kernels.deformation.svd import frame_singular_values
-from warpgarment.kernels.launch import as_argument, expect, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate, row_operator
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.closest import MAX_DISTANCE, Bodies, closest_on_body
@@ -98,6 +98,8 @@ def nearest_motion(bodies: Bodies, b: int, point: wp.vec3, next_vertices: wp.arr
 
 @wp.kernel(enable_backward=False)
 def body_interaction_kernel(
+    # Range:
+    from_row: wp.int32,
     # Model:
     bodies: Bodies,
     # In:
@@ -111,7 +113,7 @@ def body_interaction_kernel(
     deformation: wp.array[wp.mat33],
     velocity: wp.array[wp.vec3],
 ):
-    i = wp.tid()
+    i = from_row + wp.tid()
     c, s, f, d, v = nearest_motion(bodies, body_of_face[i], centroids[i], next_vertices)
     closest[i] = c
     sign[i] = s
@@ -259,9 +261,9 @@ def body_interaction(
     )
     if rows:
         with torch_stream(device) as warp_device:
-            wp.launch(
+            launch_rows(
                 body_interaction_kernel,
-                dim=rows,
+                rows,
                 inputs=[
                     bodies.model,
                     as_argument(centroids, wp.vec3),
@@ -328,6 +330,8 @@ def face_features(
 
 @wp.kernel(enable_backward=False)
 def frame_features_kernel(
+    # Range:
+    from_row: wp.int32,
     # Model:
     bodies: Bodies,
     inverse_rest: wp.array[wp.mat33],
@@ -341,7 +345,7 @@ def frame_features_kernel(
     # Out:
     features: wp.array2d[wp.float32],
 ):
-    i = wp.tid()
+    i = from_row + wp.tid()
     exist, a, b, c, mean = face_and_mean(i, faces, garment_of_face, vertices, garment_mean, features)
     if not exist:
         return
@@ -381,9 +385,9 @@ def frame_features(
     features = allocate((rows, FEATURES), torch.float32, device)
     if rows:
         with torch_stream(device) as warp_device:
-            wp.launch(
+            launch_rows(
                 frame_features_kernel,
-                dim=rows,
+                rows,
                 inputs=[
                     bodies.model,
                     as_argument(inverse_rest, wp.mat33),

@@ -21,7 +21,7 @@ from collections.abc import Callable
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .factor import Factor
@@ -106,6 +106,8 @@ def substitute_back(
 
 @wp.kernel(enable_backward=False)
 def substitute(
+    # Range:
+    from_row: wp.int32,
     # Model:
     start: wp.array[wp.int32],
     rows: wp.array[wp.int32],
@@ -125,7 +127,7 @@ def substitute(
     solution: wp.array[wp.vec3d],
 ):
     """One component per thread; rows of components without a factor are not changed."""
-    component = wp.tid()
+    component = from_row + wp.tid()
     b = base[component]
     if b >= 0:
         begin = start[component]
@@ -239,7 +241,7 @@ def solve(
         if not factor.explicit:
             scratch = allocate((factor.places, 4), torch.float64, rhs.device)
             inputs = [*common, *substitution(factor), load, as_argument(scratch, wp.vec4d), result]
-            wp.launch(substitute, dim=len(factor.base), inputs=inputs, device=device)
+            launch_rows(substitute, len(factor.base), inputs, [], device, least=1)
             return
         base, order = as_argument(factor.base, wp.int32), as_argument(factor.order, wp.int32)
         columns, rows = (
@@ -273,7 +275,7 @@ def recorded(
     common = [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32), *substitution(factor)]
     work = [as_argument(rhs, wp.vec3d), as_argument(scratch, wp.vec4d), as_argument(solution, wp.vec3d)]
     device = wp.device_from_torch(rhs.device)
-    command = wp.launch(substitute, dim=len(factor.base), inputs=[*common, *work], device=device, record_cmd=True)
+    command = wp.launch(substitute, dim=len(factor.base), inputs=[0, *common, *work], device=device, record_cmd=True)
 
     def launch(kept: torch.Tensor = scratch) -> None:  # the launch itself keeps no memory alive
         command.launch()

@@ -18,6 +18,8 @@ def rest_edge(rest_vertices: wp.array[wp.vec3], a: int, b: int) -> wp.vec3d:
 
 @wp.kernel(enable_backward=False)
 def right_hand_side(
+    # Range:
+    from_row: wp.int32,
     # Model:
     faces: wp.array[wp.vec3i],
     half_cotangent: wp.array[wp.vec3d],
@@ -34,7 +36,7 @@ def right_hand_side(
     rhs: wp.array[wp.vec3d],
 ):
     """The right-hand side g of solver.py, gathered by each vertex from its corners in a fixed order."""
-    a = wp.tid()
+    a = from_row + wp.tid()
     v = initial[a]
     g = wp.vec3d()
     e = corner_start[a]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System, block_dim
@@ -120,9 +120,9 @@ def poisson_solve(
     if count == 0:
         return vertices, vertices.new_empty(0, dtype=torch.int32), vertices.new_empty(0, dtype=torch.float64)
     with torch_stream(phi.device) as device:
-        wp.launch(
+        launch_rows(
             right_hand_side,
-            dim=len(guess),
+            len(guess),
             inputs=[
                 as_argument(tensors["faces"], wp.vec3i),
                 as_argument(tensors["half_cotangent"], wp.vec3d),
@@ -136,6 +136,7 @@ def poisson_solve(
                 as_argument(pin_target, wp.vec3),
                 as_argument(rhs, wp.vec3d),
             ],
+            outputs=[],
             device=device,
         )
         increment, report, error = _solve(model, rhs, tensors["tolerance"], 0.0, max_iterations)

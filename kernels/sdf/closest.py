@@ -14,7 +14,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .inside import is_inside
@@ -119,6 +119,8 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
 
 @wp.kernel(enable_backward=False)
 def query_bodies_kernel(
+    # Range:
+    from_row: wp.int32,
     # Model:
     bodies: Bodies,
     # In:
@@ -131,7 +133,7 @@ def query_bodies_kernel(
     face: wp.array[wp.int32],
     barycentric: wp.array[wp.vec3],
 ):
-    i = wp.tid()
+    i = from_row + wp.tid()
     b = body_of_point[i]
     distance[i] = wp.nan
     closest[i] = wp.vec3(wp.nan)
@@ -171,9 +173,9 @@ def query_bodies(
     face, barycentric = allocate((rows,), torch.int32, device), allocate((rows, 3), torch.float32, device)
     if rows:
         with torch_stream(device) as warp_device:
-            wp.launch(
+            launch_rows(
                 query_bodies_kernel,
-                dim=rows,
+                rows,
                 inputs=[
                     model,
                     as_argument(points, wp.vec3),

@@ -12,11 +12,16 @@ corners are all outside. The points examined are
 Of these, the points inside the body count; their depth is the distance to its surface. An edge of the body that crosses
 an edge of the garment can still be missed.
 
+A vertex outside at a distance r from the body has a ball of that radius around it without any surface: the middles of
+edges and faces and the points c within it are outside too, and are not examined. Distances are found up to a limit of
+half an edge.
+
 | symbol | code | what |
 | --- | --- | --- |
 | x, n | `x, y, z`, `normal` | corners of a face [m], its normal |
 | u, c | `tip`, `foot` | vertex of the body, the nearest point on a face of the garment [m] |
 | l | `STANDS_OUT` | limit of the distance between them [m] |
+| r | `clear` | distance of a vertex that is outside from the body, or the limit if that is less; 0 inside [m] |
 | | `missing` | how much deeper the edges and faces at a vertex are than their corners [m] |
 """
 
@@ -27,15 +32,17 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, expect, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import Bodies, closest_on_body
+from .closest import BEYOND, Bodies, closest_on_body
 from .nearest_face import closest_on_triangle
 
 STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""
+ROUNDING = wp.constant(2.0e-6)
+"""Lengths [m] that are in a ball by less than this are examined."""
 
 
 class SurfaceDepth(NamedTuple):
@@ -57,6 +64,8 @@ def depth_at(bodies: Bodies, b: int, point: wp.vec3) -> float:
 
 @wp.kernel(enable_backward=False)
 def feet_of_tips(
+    # Range:
+    from_row: wp.int32,
     # Model:
     bodies: Bodies,
     faces: wp.array[wp.vec3i],
@@ -70,7 +79,7 @@ def feet_of_tips(
 
     This is a kernel of its own, because two kinds of queries do not fit in the shared memory of a GPU.
     """
-    i = wp.tid()
+    i = from_row + wp.tid()
     feet[i] = wp.vec3(wp.nan)
     b = body_of_vertex[faces[i][0]]
     if b < 0 or b >= bodies.meshes.shape[0]:
@@ -103,68 +112,118 @@ def feet_of_tips(
 
 @wp.kernel(enable_backward=False)
 def depth_of_vertices(
+    # Range:
+    from_row: wp.int32,
     # Model:
     bodies: Bodies,
-    garment_of_vertex: wp.array[wp.int32],
     # In:
     vertices: wp.array[wp.vec3],
     body_of_vertex: wp.array[wp.int32],
+    limit: wp.float32,
     # Out:
     depth: wp.array[wp.float32],
-    missing: wp.array[wp.float32],
-    deepest: wp.array[wp.float32],  # accumulated
+    clear: wp.array[wp.float32],
 ):
-    i = wp.tid()
+    i = from_row + wp.tid()
     depth[i] = 0.0
-    missing[i] = 0.0
+    clear[i] = 0.0
     b = body_of_vertex[i]
     if b >= 0 and b < bodies.meshes.shape[0]:
-        depth[i] = depth_at(bodies, b, vertices[i])
-        wp.atomic_max(deepest, garment_of_vertex[i], depth[i])
+        found, sign, _weights, closest = closest_on_body(bodies, b, vertices[i], limit)
+        if found >= 0:
+            away = wp.float32(wp.length(wp.vec3d(vertices[i]) - closest))
+            depth[i] = wp.where(sign < 0.0, away, 0.0)
+            clear[i] = wp.where(sign < 0.0, 0.0, away)
+        elif found == BEYOND:
+            clear[i] = limit
+
+
+@wp.func
+def in_a_ball(point: wp.vec3, x: wp.vec3, y: wp.vec3, z: wp.vec3, radius: wp.vec3) -> bool:
+    """Whether a point is in the ball without surface around a corner."""
+    return (
+        wp.length(point - x) + ROUNDING < radius[0]
+        or wp.length(point - y) + ROUNDING < radius[1]
+        or wp.length(point - z) + ROUNDING < radius[2]
+    )
 
 
 @wp.kernel(enable_backward=False)
 def depth_between_vertices(
+    # Range:
+    from_row: wp.int32,
     # Model:
     bodies: Bodies,
-    garment_of_vertex: wp.array[wp.int32],
     edges: wp.array[wp.vec2i],
     faces: wp.array[wp.vec3i],
     # In:
     vertices: wp.array[wp.vec3],
     body_of_vertex: wp.array[wp.int32],
-    depth: wp.array[wp.float32],
+    clear: wp.array[wp.float32],
     feet: wp.array[wp.vec3],
     # Out:
-    missing: wp.array[wp.float32],  # accumulated
-    deepest: wp.array[wp.float32],  # accumulated
+    between: wp.array[wp.float32],
 ):
     """Depth between the vertices of one edge or one face."""
-    i = wp.tid()
+    i = from_row + wp.tid()
     corner = wp.vec3i()
     is_face = i >= edges.shape[0]
     if is_face:
         corner = faces[i - edges.shape[0]]
     else:
         corner = wp.vec3i(edges[i][0], edges[i][1], edges[i][1])
+    between[i] = 0.0
     b = body_of_vertex[corner[0]]
     if b < 0 or b >= bodies.meshes.shape[0]:
         return
     x = vertices[corner[0]]
     y = vertices[corner[1]]
     z = vertices[corner[2]]
-    garment = garment_of_vertex[corner[0]]
+    radius = wp.vec3(clear[corner[0]], clear[corner[1]], clear[corner[2]])
+    middle = 0.5 * (x + y)
     worst = wp.float32(0.0)
     if is_face:
-        worst = wp.max(depth_at(bodies, b, (x + y + z) / 3.0), depth_at(bodies, b, feet[i - edges.shape[0]]))
+        middle = (x + y + z) / 3.0
+        foot = feet[i - edges.shape[0]]
+        if not in_a_ball(foot, x, y, z, radius):
+            worst = depth_at(bodies, b, foot)
+    if not in_a_ball(middle, x, y, z, radius):
+        worst = wp.max(worst, depth_at(bodies, b, middle))
+    between[i] = worst
+
+
+@wp.kernel(enable_backward=False)
+def collect_depth(
+    # Model:
+    garment_of_vertex: wp.array[wp.int32],
+    edges: wp.array[wp.vec2i],
+    faces: wp.array[wp.vec3i],
+    # In:
+    depth: wp.array[wp.float32],
+    between: wp.array[wp.float32],
+    # Out:
+    missing: wp.array[wp.float32],  # accumulated
+    deepest: wp.array[wp.float32],  # accumulated
+):
+    """Depths of vertices, edges and faces, in this order, for garments and vertices; on a CPU on one thread."""
+    i = wp.tid()
+    if i < depth.shape[0]:
+        if depth[i] > 0.0:
+            wp.atomic_max(deepest, garment_of_vertex[i], depth[i])
+        return
+    i -= depth.shape[0]
+    if not between[i] > 0.0:
+        return
+    corner = wp.vec3i()
+    if i >= edges.shape[0]:
+        corner = faces[i - edges.shape[0]]
     else:
-        worst = depth_at(bodies, b, 0.5 * (x + y))
-    more = worst - wp.max(depth[corner[0]], wp.max(depth[corner[1]], depth[corner[2]]))
+        corner = wp.vec3i(edges[i][0], edges[i][1], edges[i][1])
+    more = between[i] - wp.max(depth[corner[0]], wp.max(depth[corner[1]], depth[corner[2]]))
     if more > 0.0:
-        wp.atomic_max(deepest, garment, worst)
-        wp.atomic_max(missing, corner[0], more)
-        wp.atomic_max(missing, corner[1], more)
-        wp.atomic_max(missing, corner[2], more)
+        wp.atomic_max(deepest, garment_of_vertex[corner[0]], between[i])
+        for k in range(3):
+            wp.atomic_max(missing, corner[k], more)
 
 
 def surface_depth(
@@ -175,6 +234,8 @@ def surface_depth(
     faces: torch.Tensor,
     garment_of_vertex: torch.Tensor,
     count: int,
+    *,
+    limit: float = 0.0,
 ) -> SurfaceDepth:
     """Depths of a packed batch of garments; without gradients.
 
@@ -186,6 +247,8 @@ def surface_depth(
         faces: Packed vertex indices, int32 [F,3].
         garment_of_vertex: Garment of each vertex, int32 [V].
         count: Number of garments B.
+        limit: Largest distance of vertices that is looked for [m], to leave out what is around them. It changes the
+            time only; half an edge is a good one.
 
     Raises:
         ValueError: Wrong shape or device.
@@ -197,41 +260,24 @@ def surface_depth(
     expect("faces", faces, (None, 3), torch.int32, device)
     for name, tensor in (("body_of_vertex", body_of_vertex), ("garment_of_vertex", garment_of_vertex)):
         expect(name, tensor, (size,), torch.int32, device)
-    depth, missing = allocate((2, size), torch.float32, device)
-    feet = allocate((len(faces), 3), torch.float32, device)
-    deepest = torch.zeros(count, dtype=torch.float32, device=device)
-    owners, points = as_argument(garment_of_vertex, wp.int32), as_argument(vertices.detach(), wp.vec3)
-    body = as_argument(body_of_vertex, wp.int32)
-    results = [as_argument(tensor, wp.float32) for tensor in (depth, missing, deepest)]
+    depth, clear = allocate((2, size), torch.float32, device)
+    feet, between = (allocate(shape, torch.float32, device) for shape in ((len(faces), 3), (len(edges) + len(faces),)))
+    missing, deepest = (torch.zeros(length, dtype=torch.float32, device=device) for length in (size, count))
+    points, body = as_argument(vertices.detach(), wp.vec3), as_argument(body_of_vertex, wp.int32)
+    lines, triangles = as_argument(edges, wp.vec2i), as_argument(faces, wp.vec3i)
+    foot, depths, rest = (as_argument(feet, wp.vec3), *(as_argument(t, wp.float32) for t in (depth, between)))
+    balls = as_argument(clear, wp.float32)
     with torch_stream(device) as warp_device:
+        launch_rows(feet_of_tips, len(faces), [bodies.model, triangles, points, body], [foot], warp_device)
+        found = [depths, balls]
+        launch_rows(depth_of_vertices, size, [bodies.model, points, body, float(limit)], found, warp_device)
+        inputs = [bodies.model, lines, triangles, points, body, balls, foot]
+        launch_rows(depth_between_vertices, len(between), inputs, [rest], warp_device)
         wp.launch(
-            feet_of_tips,
-            dim=len(faces),
-            inputs=[bodies.model, as_argument(faces, wp.vec3i), points, body],
-            outputs=[as_argument(feet, wp.vec3)],
-            device=warp_device,
-        )
-        wp.launch(
-            depth_of_vertices,
-            dim=size,
-            inputs=[bodies.model, owners, points, body],
-            outputs=results,
-            device=warp_device,
-        )
-        wp.launch(
-            depth_between_vertices,
-            dim=len(edges) + len(faces),
-            inputs=[
-                bodies.model,
-                owners,
-                as_argument(edges, wp.vec2i),
-                as_argument(faces, wp.vec3i),
-                points,
-                body,
-                results[0],
-                as_argument(feet, wp.vec3),
-            ],
-            outputs=results[1:],
+            collect_depth,
+            dim=size + len(between),
+            inputs=[as_argument(garment_of_vertex, wp.int32), lines, triangles, depths, rest],
+            outputs=[as_argument(missing, wp.float32), as_argument(deepest, wp.float32)],
             device=warp_device,
         )
     return SurfaceDepth(deepest, missing)

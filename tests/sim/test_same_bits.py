@@ -48,6 +48,21 @@ def test_small_garments_of_other_sizes_differ_by_rounding_only():
         assert 1000.0 * np.abs(apart).max() < OFF
 
 
+def test_fast_gives_the_same_bits_with_any_number_of_threads(assets):
+    """Ranges of a launch or blocks of faces would depend on the number of threads, or write to each other's rows."""
+    simulator = wg.Simulator.from_pretrained("fast", device="cpu")
+    before, kept = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            kept.append([motion.vertices for motion in rolled(simulator, assets, ["dress", "tshirt"])])
+    finally:
+        torch.set_num_threads(before)
+    for other in kept[1:]:
+        for one, same in zip(kept[0], other, strict=True):
+            np.testing.assert_array_equal(one, same)
+
+
 @pytest.mark.parametrize("network", ["fast", "small"])
 def test_numbers_of_threads_differ_by_rounding_only(network, assets):
     """Threads would share out work so that something is left out or done twice: the documented bound."""

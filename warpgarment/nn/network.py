@@ -41,10 +41,12 @@ class GarmentNetwork(nn.Module):
     Attributes:
         reads: Names of the optional fields of `FrameInputs` that `predict` needs: `previous`, `materials`, `wind`,
             `pairs`, `skin`. Outdoor channels of `config` add those that they need.
+        shares_threads: Whether it uses the pool of `kernels/threads.py` on a CPU. Others get torch's threads.
         statistics: Buffers of the normalisation and their lengths.
     """
 
     reads: frozenset[str] = frozenset()
+    shares_threads: bool = False
     statistics: Mapping[str, int] = STATISTICS
 
     embed_faces: nn.Linear

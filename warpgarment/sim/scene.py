@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import torch
 
@@ -18,6 +19,7 @@ from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
 from warpgarment.kernels.features.skin import Skin, bind
+from warpgarment.kernels.threads import torch_on_all
 from warpgarment.nn.inputs import FrameInputs, VertexStep
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import Step
@@ -194,7 +196,7 @@ class Scene:
 
     def predict(self, inputs: FrameInputs) -> Step | VertexStep:
         """Step 2 of a frame: the network predicts the step to t+1."""
-        with self.timings("network"):
+        with self.timings("network"), nullcontext() if self.network.shares_threads else torch_on_all():
             return self.network.predict(inputs, self.layout, bfloat16=self.half)
 
 

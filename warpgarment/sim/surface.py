@@ -16,6 +16,7 @@ from warpgarment.kernels.sdf.surface_depth import SurfaceDepth, surface_depth
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
+REACH = 0.6  # of a mean edge, to which distances of vertices are looked for: a little more than half of most edges
 AMPLE = 1.5  # corners are moved by this multiple of the depth between them, since a corner that is far does not follow
 
 
@@ -33,12 +34,22 @@ class Surface:
         edges = np.concatenate([garment.edges + start for garment, start in zip(garments, starts, strict=True)])
         self._edges = torch.from_numpy(edges.astype(np.int32)).to(device)
         self._packed = packed
+        one, other = packed.rest_vertices[self._edges.long()].unbind(1)
+        length = (one - other).norm(dim=1)
+        self._limit = REACH * float(length.mean()) if len(length) else 0.0
 
     def depth(self, vertices: torch.Tensor, bodies: BodyMeshes, body_of_vertex: torch.Tensor) -> SurfaceDepth:
         """Depth of vertices [V,3], edges and faces in the bodies [m], see `SurfaceDepth`."""
         packed = self._packed
         return surface_depth(
-            vertices, bodies, body_of_vertex, self._edges, packed.faces, packed.garment_of_vertex, packed.count
+            vertices,
+            bodies,
+            body_of_vertex,
+            self._edges,
+            packed.faces,
+            packed.garment_of_vertex,
+            packed.count,
+            limit=self._limit,
         )
 
 

@@ -26,6 +26,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import NormalisedOutput
 from warpgarment.nn.network import GarmentNetwork
 
+from . import blocks
 from .layout import PatchLayout
 
 if TYPE_CHECKING:
@@ -64,11 +65,13 @@ class FaceLayer(nn.Module):
 
 
 class PatchTransformer(GarmentNetwork):
-    """Faces are pooled into patches, which attend to each other.
+    """Faces are pooled into patches, which attend to each other. On a CPU without gradients it runs by blocks of faces.
 
     Args:
         config: Shape and settings; `NetworkConfig.fast()` is the named one.
     """
+
+    shares_threads = True
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -145,6 +148,8 @@ class PatchTransformer(GarmentNetwork):
         if turn is None:
             return F.linear(face_features, scaled.flatten(1), bias)
         turned = torch.einsum("ehi,bij->behj", scaled, self.channels.turn(turn)).flatten(2)
+        if blocks.by_blocks(face_features):
+            return blocks.linear(face_features, turned, bias)
         if len(turned) == 1:
             return F.linear(face_features, turned[0], bias)
         return torch.baddbmm(bias, face_features, turned.mT)
@@ -188,6 +193,11 @@ class PatchTransformer(GarmentNetwork):
         """Embedded faces [B,N,F] and velocities [B,C,E] -> normalised output."""
         batch, count = faces.shape[:2]
         patches = weights.start.shape[1]
+        if blocks.by_blocks(faces):
+            mask = self._key_mask(weights, velocity_mask, tokens)
+            answer, velocity = blocks.forward(self, faces.contiguous(), tokens, weights, mask)
+            psi, singular_values = answer.split([9, 3], dim=-1)
+            return NormalisedOutput(psi, singular_values, velocity)
         row = torch.arange(batch, device=faces.device)[:, None, None]
         neighbours = None if weights.neighbours is None else (weights.neighbours + count * row).flatten(0, 1)
 

@@ -1,0 +1,137 @@
+"""The cores of a CPU: one pool of threads for kernels of Warp, which run on one thread each, and for torch by blocks.
+
+Calls that are spread over the pool must write to memory that no other of them reads or writes. What they compute must
+not depend on which thread runs them, nor on how many there are; so results have the same bits with any number of
+threads.
+
+The number of threads is torch's (`OMP_NUM_THREADS`, `torch.set_num_threads`; by default the number of cores). Within
+`torch_on_one` torch itself works on one: its own threads spin while they wait for each other, which takes a hundred
+times as long if another process has one of the cores. Threads of the pool sleep.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+
+Call = Callable[[], object]
+
+_local = threading.local()
+_tasks: queue.SimpleQueue[Call] = queue.SimpleQueue()
+_started: list[threading.Thread] = []
+_starting = threading.Lock()
+
+
+def count() -> int:
+    """Number of threads that share the work of this one: 1 within a thread of the pool."""
+    number: int = getattr(_local, "count", 0) or torch.get_num_threads()
+    return number
+
+
+@contextlib.contextmanager
+def torch_on_one() -> Iterator[None]:
+    """Context in which torch uses one thread on the CPU, and `count` is what torch had before."""
+    if getattr(_local, "count", 0) or torch.get_num_threads() == 1:
+        yield
+        return
+    _local.count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(_local.count)
+        _local.count = 0
+
+
+@contextlib.contextmanager
+def torch_on_all() -> Iterator[None]:
+    """Context within `torch_on_one` in which torch has its threads again, for work that is not spread by blocks."""
+    number = getattr(_local, "count", 0)
+    if number <= 1:
+        yield
+        return
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(1)
+
+
+def spread(calls: Sequence[Call]) -> None:
+    """Runs calls on the threads of the pool and on this one, and returns when all have ended.
+
+    Args:
+        calls: Calls that are independent of each other. They run in torch's grad and inference mode of this thread.
+
+    Raises:
+        Exception: The first exception of a call; the others have ended by then.
+    """
+    helpers = min(count(), len(calls)) - 1
+    if helpers <= 0:
+        for call in calls:
+            call()
+        return
+    left, failed = iter(calls), list[BaseException]()
+    take, done = threading.Lock(), threading.Semaphore(0)
+    inference, grad = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+    def work() -> None:
+        while True:
+            with take:
+                call = next(left, None)
+            if call is None or failed:
+                return
+            try:
+                call()
+            except BaseException as error:
+                failed.append(error)
+
+    def helped() -> None:
+        try:
+            with torch.inference_mode(inference), torch.set_grad_enabled(grad):
+                work()
+        finally:
+            done.release()
+
+    _start(helpers)
+    for _ in range(helpers):
+        _tasks.put(helped)
+    work()
+    for _ in range(helpers):
+        done.acquire()
+    if failed:
+        raise failed[0]
+
+
+def _start(number: int) -> None:
+    """Starts threads of the pool until there are that many."""
+    if len(_started) >= number:
+        return
+    with _starting:
+        while len(_started) < number:
+            thread = threading.Thread(target=_serve, name=f"warpgarment-{len(_started)}", daemon=True)
+            thread.start()
+            _started.append(thread)
+
+
+def _forget() -> None:
+    """In a forked process, where no thread of the pool is left."""
+    global _tasks, _starting
+    _started.clear()
+    _tasks, _starting = queue.SimpleQueue(), threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+def _serve() -> None:
+    _local.count = 1
+    torch.set_num_threads(1)
+    while True:
+        _tasks.get()()
