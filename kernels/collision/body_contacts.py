@@ -56,7 +56,6 @@ def half_of_the_room(mesh: wp.uint64, point: wp.vec3, outward: wp.vec3, distance
 
 @wp.kernel(enable_backward=False)
 def find_contacts(
-    # Range:
     from_row: wp.int32,
     # Body:
     bodies: Bodies,

@@ -34,7 +34,6 @@ from warpgarment.kernels.operator import allocate
 
 @wp.kernel(enable_backward=False)
 def contact_forces(
-    # Range:
     from_row: wp.int32,
     # Model:
     start: wp.array[wp.int32],

@@ -31,7 +31,6 @@ wp.set_module_options({"max_unroll": 1})  # unrolled loops over sixteen would co
 
 @wp.kernel(enable_backward=False)
 def wide_contacts(
-    # Range:
     from_row: wp.int32,
     # Model:
     start: wp.array[wp.int32],

@@ -44,7 +44,6 @@ def broken_garments_kernel(
 
 @wp.kernel(enable_backward=False)
 def next_gradients_kernel(
-    # Range:
     from_row: wp.int32,
     # Model:
     garment_of_face: wp.array[wp.int32],

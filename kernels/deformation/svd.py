@@ -280,7 +280,6 @@ def replace_singular_values_kernel(
 
 @wp.kernel(enable_backward=False)
 def rotation_kernel(
-    # Range:
     from_row: wp.int32,
     # In:
     phi: wp.array[wp.mat33],

@@ -98,7 +98,6 @@ def nearest_motion(bodies: Bodies, b: int, point: wp.vec3, next_vertices: wp.arr
 
 @wp.kernel(enable_backward=False)
 def body_interaction_kernel(
-    # Range:
     from_row: wp.int32,
     # Model:
     bodies: Bodies,
@@ -259,6 +258,7 @@ def body_interaction(
         deformation=allocate((rows, 3, 3), torch.float32, device),
         velocity=allocate((rows, 3), torch.float32, device),
     )
+    kinds = wp.vec3, wp.float32, wp.int32, wp.mat33, wp.vec3
     if rows:
         with torch_stream(device) as warp_device:
             launch_rows(
@@ -270,13 +270,7 @@ def body_interaction(
                     as_argument(body_of_face, wp.int32),
                     as_argument(next_vertices, wp.vec3),
                 ],
-                outputs=[
-                    as_argument(found.closest, wp.vec3),
-                    as_argument(found.sign, wp.float32),
-                    as_argument(found.face, wp.int32),
-                    as_argument(found.deformation, wp.mat33),
-                    as_argument(found.velocity, wp.vec3),
-                ],
+                outputs=[as_argument(tensor, kind) for tensor, kind in zip(found, kinds, strict=True)],
                 device=warp_device,
             )
     return found
@@ -330,7 +324,6 @@ def face_features(
 
 @wp.kernel(enable_backward=False)
 def frame_features_kernel(
-    # Range:
     from_row: wp.int32,
     # Model:
     bodies: Bodies,

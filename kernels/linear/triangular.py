@@ -106,7 +106,6 @@ def substitute_back(
 
 @wp.kernel(enable_backward=False)
 def substitute(
-    # Range:
     from_row: wp.int32,
     # Model:
     start: wp.array[wp.int32],

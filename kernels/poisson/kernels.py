@@ -18,7 +18,6 @@ def rest_edge(rest_vertices: wp.array[wp.vec3], a: int, b: int) -> wp.vec3d:
 
 @wp.kernel(enable_backward=False)
 def right_hand_side(
-    # Range:
     from_row: wp.int32,
     # Model:
     faces: wp.array[wp.vec3i],

@@ -119,7 +119,6 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
 
 @wp.kernel(enable_backward=False)
 def query_bodies_kernel(
-    # Range:
     from_row: wp.int32,
     # Model:
     bodies: Bodies,

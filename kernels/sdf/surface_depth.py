@@ -64,7 +64,6 @@ def depth_at(bodies: Bodies, b: int, point: wp.vec3) -> float:
 
 @wp.kernel(enable_backward=False)
 def feet_of_tips(
-    # Range:
     from_row: wp.int32,
     # Model:
     bodies: Bodies,
@@ -112,7 +111,6 @@ def feet_of_tips(
 
 @wp.kernel(enable_backward=False)
 def depth_of_vertices(
-    # Range:
     from_row: wp.int32,
     # Model:
     bodies: Bodies,
@@ -150,7 +148,6 @@ def in_a_ball(point: wp.vec3, x: wp.vec3, y: wp.vec3, z: wp.vec3, radius: wp.vec
 
 @wp.kernel(enable_backward=False)
 def depth_between_vertices(
-    # Range:
     from_row: wp.int32,
     # Model:
     bodies: Bodies,

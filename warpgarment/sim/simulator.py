@@ -183,7 +183,7 @@ class Simulator:
         frame, which holds NaN, with a status that says so and a RuntimeWarning.
 
         On a CPU the result is repeated bit for bit, and is that of each garment alone if it has more than 512 faces.
-        It may depend on the number of threads in the last bit, which can grow to a millimetre: docs/rounding.md.
+        Networks other than those of patches may differ with the threads, up to a millimetre: docs/rounding.md.
 
         Args:
             garment: One garment, a list, an `Outfit`, or a list of outfits.

@@ -95,9 +95,8 @@ def forward(
         _perceptron(network.before, x, network.before.norm(x), None)
 
     def patch(r: int) -> None:
-        pooled = F.embedding_bag(
-            of(layout.member, r), faces[r], of(layout.start, r), mode="sum", per_sample_weights=of(layout.member_weight, r)
-        )[None]
+        members, shares = of(layout.member, r), of(layout.member_weight, r)
+        pooled = F.embedding_bag(members, faces[r], of(layout.start, r), mode="sum", per_sample_weights=shares)[None]
         mean = of(layout.pieces, r) @ pooled
         x = torch.cat([network.to_patches(pooled), tokens[r : r + 1] + one_by_one(network.to_velocity, mean)], dim=1)
         start, geodesic, real = x, of(layout.weights, r)[None], None if mask is None else of(mask, r)[None]
