@@ -16,7 +16,6 @@ import torch
 from warpgarment.errors import UsageError
 from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
-from warpgarment.kernels.threads import torch_on_one
 from warpgarment.nn import checkpoint
 from warpgarment.nn.device import device_of
 from warpgarment.nn.network import GarmentNetwork
@@ -396,6 +395,5 @@ class Simulator:
     ) -> SimulationState[Vertices, Status]:
         scene, now = state.scene, state.now.blown(wind)
         graph = None if self.timings.synchronise else state.graph
-        with torch_on_one():
-            after = advance(scene, now, next_body) if graph is None else graph(now, next_body)
+        after = advance(scene, now, next_body) if graph is None else graph(now, next_body)
         return SimulationState(scene, state.single, state.frame + 1, after, state.graph)
