@@ -35,7 +35,6 @@ NOT_RUN = {  # blocks of Python that say so in their first line, by what that li
     ("docs/layersnet.md", "# not run by the tests: no weights ship"),
     ("docs/bodies.md", "# not run by the tests: making Anny's body takes two minutes"),
     ("docs/viewer.md", "# not run by the tests: waits for Ctrl+C"),
-    ("docs/dressing.md", "# not run by the tests: needs your files; tests/dressing runs wg.dress"),
 }
 CARDS = "warpgarment/assets/weights/"  # whose commands are those that made the networks
 RUNS_ON = {  # verbs that run on one page, and of which the options are read on all others

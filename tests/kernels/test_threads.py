@@ -6,7 +6,7 @@ import pytest
 import torch
 import warp as wp
 
-from warpgarment.kernels import launch, threads
+from warpgarment.kernels import threads
 from warpgarment.kernels.launch import as_argument, launch_rows
 
 
@@ -28,8 +28,8 @@ def rows_kernel(from_row: wp.int32, scale: wp.float32, squares: wp.array[wp.floa
 @pytest.mark.parametrize("rows", [0, 1, 5, 1000, 1024])
 def test_ranges_of_a_launch_cover_every_row_once(three, monkeypatch, rows):
     """Rows would be left out, written by another range, or computed as if their range began at zero. Exact."""
-    number = []
-    monkeypatch.setattr(launch.threads, "spread", lambda calls: number.append(len(calls)) or threads.spread(calls))
+    number, spread = [], threads.spread
+    monkeypatch.setattr(threads, "spread", lambda calls: number.append(len(calls)) or spread(calls))
     squares = torch.full((rows + 1,), -1.0)
     launch_rows(rows_kernel, rows, [2.0], [as_argument(squares, wp.float32)], wp.get_device("cpu"), least=2)
     assert squares.tolist() == [2.0 * i * i for i in range(rows)] + [-1.0]

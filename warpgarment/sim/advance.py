@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import torch
 
+from warpgarment.kernels.threads import torch_on_one
+
 from .frame import Frame, earlier
 from .scene import Scene
 
 
+@torch_on_one()
 def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     """Computes frame t+1 from frame t and the bodies at t+1 [m], shape [U,3]. The host does not wait for a GPU.
 
