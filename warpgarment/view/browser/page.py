@@ -219,9 +219,8 @@ class Browser:
         server.scene.add_light_ambient("/light", intensity=1.2)
         floor = float(points[:, 1].min()) if len(points) else 0.0
         server.scene.add_grid("/floor", plane="xz", position=(0.0, floor, 0.0), width=10.0, height=10.0)
-        server.initial_camera.position = tuple(
-            (np.asarray(camera.target) + camera.distance * camera.direction).tolist()
-        )
+        eye = np.asarray(camera.target) + camera.distance * camera.direction
+        server.initial_camera.position = eye
         server.initial_camera.look_at = camera.target
         server.initial_camera.fov = math.radians(camera.field_of_view)
 

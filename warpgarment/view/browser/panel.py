@@ -44,7 +44,7 @@ class Panel:
     ) -> None:
         self.scrubbed: Callable[[int], None] = lambda frame: None
         self.pressed: Callable[[], None] = lambda: None
-        gui = server.gui
+        gui: Any = server.gui  # viser's annotations make values read-only, which they are not
         self.play = gui.add_button(PLAY)
         self.frame = gui.add_slider("frame", 0, max(frames - 1, 1), 1, 0, disabled=frames < 2)
         self.speed = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
@@ -108,7 +108,7 @@ class LivePanel:
     """
 
     def __init__(self, server: viser.ViserServer, live: Live, changed: Callable[[Settings], None]) -> None:
-        gui = server.gui
+        gui: Any = server.gui
         self._live, self._changed = live, changed
         self._steady = live.wind is None  # whether the wind is that of the sliders
         speed, angle = _as_sliders(live.wind)
