@@ -32,7 +32,6 @@ RUN = {"docs/extending.md": "tests/test_extending_*.py carry out all of it"}
 NOT_RUN = {  # blocks of Python that say so in their first line, by what that line says
     ("docs/readers.md", "# not run by the tests: needs a sample of CLOTH3D and a body model"),
     ("docs/readers.md", "# not run by the tests: needs the SMPL model files"),
-    ("docs/layersnet.md", "# not run by the tests: no weights ship"),
     ("docs/bodies.md", "# not run by the tests: making Anny's body takes two minutes"),
     ("docs/viewer.md", "# not run by the tests: waits for Ctrl+C"),
 }
