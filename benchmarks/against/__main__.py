@@ -29,7 +29,7 @@ from warpgarment.view.markdown import table
 
 from .cases import CASES, Case
 from .environment import python_of
-from .processes import Worker, fresh, trained
+from .processes import Worker, demo_motions, fresh, trained
 
 Row = dict[str, Any]
 SAME = 0.02  # mm by which one frame from the same state may differ
@@ -50,7 +50,7 @@ def measured(builds: Builds, options: argparse.Namespace, folder: Path) -> Itera
         if case.kind == "train":
             yield _row(case, _in_turns(builds, case, lambda python, case=case: trained(python, case, folder), 3))
         elif case.kind == "next":
-            yield _same_state(builds, case)
+            yield _same_state(builds, case, folder)
         elif case.fresh:
             rounds, given = min(options.rounds, case.rounds), scenes(case.options, folder)
             yield _row(
@@ -88,12 +88,12 @@ def _with_workers(builds: Builds, case: Case, options: argparse.Namespace, folde
             worker.close()
 
 
-def _same_state(builds: Builds, case: Case) -> Row:
+def _same_state(builds: Builds, case: Case, folder: Path) -> Row:
     """Distance between the positions that both builds predict from the same history."""
     answers = []
     for python in builds:
         worker = Worker(python, case.threads)
-        worker.ask("prepare", "case", "next", case.options)
+        worker.ask("prepare", "case", "next", case.options | {"motions": demo_motions(folder)})
         answers.append(worker.ask("run", "case")["result"])
         worker.close()
     apart = [

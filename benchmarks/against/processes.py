@@ -93,6 +93,18 @@ def trained(python: Path, case: Case, folder: Path) -> float:
     return (at[steps[-1]] - at[steps[0]]) / (steps[-1] - steps[0])
 
 
+def demo_motions(folder: Path) -> list[str]:
+    """The demo's garments and their recorded motions as files, since those that a build brings may be others."""
+    assets, paths = wg.demo.assets(), []
+    for name, item in sorted(assets.garments.items()):
+        path = folder / f"{name}_recorded.npz"
+        garment, body = item.garment, assets.collider
+        arrays = {"vertices": garment.vertices, "faces": garment.faces, "pins": garment.pins}
+        np.savez(path, frames=item.truth.vertices, body=body.vertices, body_faces=body.faces, **arrays)
+        paths.append(str(path))
+    return paths
+
+
 def _training_data(folder: Path) -> Path:
     """The demo's garments as sequences of 60 frames, written once."""
     data = folder / "sequences"

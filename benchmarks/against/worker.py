@@ -80,21 +80,22 @@ class SetUp:
 class NextFrames:
     """The frame after each of several known histories, as positions: what two builds make of the same state."""
 
-    def __init__(self, starts: list[int], network: str = "fast") -> None:
-        self.starts, self.simulator = starts, simulator(network)
+    def __init__(self, motions: list[str], starts: list[int], network: str = "fast") -> None:
+        self.motions, self.starts, self.simulator = motions, starts, simulator(network)
 
     def __call__(self) -> list[list[Any]]:
-        """Name of the garment, first known frame and positions [m] for each history."""
-        assets, found = wg.demo.assets(), []
+        """File of the motion, first known frame and positions [m] for each history."""
+        found = []
         known = self.simulator.network.config.history
-        for name, item in sorted(assets.garments.items()):
-            if item.truth is None:
-                continue
+        for path in self.motions:
+            with np.load(path) as data:
+                garment = wg.Garment(data["vertices"], data["faces"], pins=data["pins"])
+                frames, bodies, body_faces = data["frames"], data["body"], data["body_faces"]
             for start in self.starts:
-                history = item.truth.vertices[start : start + known]
-                body = wg.BodyMotion(assets.collider.vertices[start:], assets.collider.faces, assets.collider.fps)
-                motion = self.simulator.rollout(item.garment, body, history=history, frames=known + 1)
-                found.append([name, start, motion.vertices[known].tolist()])
+                body = wg.BodyMotion(bodies[start:], body_faces, 30.0)
+                history = frames[start : start + known]
+                motion = self.simulator.rollout(garment, body, history=history, frames=known + 1)
+                found.append([path, start, motion.vertices[known].tolist()])
         return found
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.against.environment import ROOT, NoSuchCommit, python_of
-from benchmarks.against.processes import Worker
+from benchmarks.against.processes import Worker, demo_motions
 
 
 def test_each_build_runs_its_own_code(tmp_path):
@@ -16,10 +16,12 @@ def test_each_build_runs_its_own_code(tmp_path):
     try:
         worker = Worker(python_of("HEAD", tmp_path), 1)
         assert str(tmp_path) in worker.about["package"]
-        worker.ask("prepare", "case", "next", {"starts": [0]})
+        motions = demo_motions(tmp_path)
+        worker.ask("prepare", "case", "next", {"starts": [0], "motions": motions})
         answers = worker.ask("run", "case")["result"]
         worker.close()
-        assert [name for name, _, _ in answers] == ["dress", "tshirt"]
+        assert [name for name, _, _ in answers] == motions
+        assert len(motions) == 2
         assert all(np.isfinite(np.array(positions)).all() for _, _, positions in answers)
     finally:
         for tree in tmp_path.glob("*/tree"):

@@ -137,5 +137,5 @@ def _perceptron(layer: FaceLayer, x: torch.Tensor, own: torch.Tensor, around: to
     """Adds to faces [B,F] what a face layer makes of their norms, and of the sums over three neighbours."""
     hidden = layer.expand(own)
     if around is not None:
-        hidden.addmm_(around, layer.hear.weight.t(), alpha=1.0 / 3.0)
+        hidden = torch.addmm(hidden, around, layer.hear.weight.t(), alpha=1.0 / 3.0)
     x += layer.contract(layer.activation(hidden))
