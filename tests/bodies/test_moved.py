@@ -120,6 +120,7 @@ def test_a_body_at_rest_is_the_one_that_moves(walk):
 
 def test_a_shape_of_anny_is_another_body(walk):
     """A value of the shape space would be ignored, or the rest pose be that of another shape."""
+    pytest.importorskip("anny", reason='the shape space is Anny\'s: pip install "warpgarment[bodies]"')
     with pytest.warns(UserWarning, match="no unit"):
         tall = wg.read_body(walk, "anny,height=0.8,gender=1")
     at_rest = wg.read_body(walk, "anny,height=0.8,gender=1", rest=True)

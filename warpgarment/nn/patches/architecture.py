@@ -72,6 +72,9 @@ class PatchesOfCloth(Architecture):
             shared = len({id(garments[g]) for g, _, _ in group}) == 1
             layouts += length * PER_PATCHED_FACE * (1 if shared else len(group))
             widths = config.face_embedding, config.face_feed_forward
+            if sizes.cpu and not sizes.half:  # by blocks: embedded faces, and what layers hand on from one to the next
+                network = max(network, len(group) * length * 4 * 3 * config.face_embedding)
+                continue
             network = max(network, activation_bytes(len(group) * length, stack, stacks, *widths, sizes.half))
         return {"geodesic weights": layouts, "network": network}
 
