@@ -28,11 +28,13 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.rows import activation_bytes, row_groups
 from warpgarment.objects.garment import Garment
 
+from .blocks import BLOCK
 from .layout import Patches, PatchLayout, garment_patches, patch_layout
 from .network import PatchTransformer
 
 PER_PATCHED_FACE = 120  # bytes for the patches of a face, its shares in them, and its neighbours
 STACKS = (1.0, 3.0)  # number of copies of the stacked features at a time, for a single garment and for several
+BLOCK_TOKENS = 3.5  # number of copies of the embedded faces of a block while it is worked on
 PRESETS = {"fast": NetworkConfig.fast()}
 
 
@@ -72,8 +74,9 @@ class PatchesOfCloth(Architecture):
             shared = len({id(garments[g]) for g, _, _ in group}) == 1
             layouts += length * PER_PATCHED_FACE * (1 if shared else len(group))
             widths = config.face_embedding, config.face_feed_forward
-            if sizes.cpu and not sizes.half:  # by blocks: embedded faces, and what layers hand on from one to the next
-                network = max(network, len(group) * length * 4 * 3 * config.face_embedding)
+            if sizes.cpu and not sizes.half:  # by blocks: of all faces only what one layer hands to the next
+                block = (stack + BLOCK_TOKENS * 4 * config.face_embedding) * min(length, BLOCK)
+                network = max(network, len(group) * length * 4 * 3 * config.face_embedding + int(block))
                 continue
             network = max(network, activation_bytes(len(group) * length, stack, stacks, *widths, sizes.half))
         return {"geodesic weights": layouts, "network": network}
