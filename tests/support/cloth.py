@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 
 from support import meshes
@@ -49,3 +50,13 @@ def stretch(garment: Garment, vertices: np.ndarray) -> np.ndarray:
     """Relative change of the length of every edge, [..., E]."""
     ends, rest = vertices[..., garment.edges, :].astype(np.float64), garment.vertices[garment.edges].astype(np.float64)
     return np.linalg.norm(np.diff(ends, axis=-2), axis=-1)[..., 0] / np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1) - 1
+
+
+def outside(vertices: np.ndarray, body: np.ndarray) -> float:
+    """The least signed distance to the ball [m]."""
+    return igl.signed_distance(
+        vertices.astype(float),
+        body.astype(float),
+        BALL.faces.astype(np.int64),
+        sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
+    )[0].min()

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import igl
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.cloth import BALL, on_ball, sheet, still, stretch
+from support.cloth import BALL, on_ball, outside, sheet, still, stretch
 
 from warpgarment.objects.garment import Garment
 from warpgarment.training.teachers import ClothScene, TeacherError
@@ -32,16 +31,6 @@ def teacher(request):
 def simulated(teacher, scene: ClothScene) -> np.ndarray:
     """All frames, [T, V, 3]."""
     return np.stack(list(teacher[0].simulate(scene)))
-
-
-def outside(vertices: np.ndarray, body: np.ndarray) -> float:
-    """The least signed distance to the ball."""
-    return igl.signed_distance(
-        vertices.astype(float),
-        body.astype(float),
-        BALL.faces.astype(np.int64),
-        sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
-    )[0].min()
 
 
 def test_cloth_drapes_over_a_moving_ball_and_stays_outside(teacher):

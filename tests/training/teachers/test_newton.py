@@ -9,7 +9,7 @@ import igl
 import numpy as np
 import pytest
 import warp as wp
-from support.cloth import BALL, flag, on_ball, sheet, still, stretch
+from support.cloth import BALL, flag, on_ball, outside, sheet, still, stretch
 
 from warpgarment.objects.garment import Garment
 from warpgarment.training.teachers import ClothScene, TeacherError, make_teacher
@@ -25,16 +25,6 @@ place = Worlds.place
 def simulated(scene: ClothScene, settings: NewtonSettings = FAST) -> np.ndarray:
     """All frames, [T, V, 3]."""
     return np.stack(list(NewtonTeacher(settings).simulate(scene)))
-
-
-def outside(vertices: np.ndarray, body: np.ndarray) -> float:
-    """The least signed distance to the ball."""
-    return igl.signed_distance(
-        vertices.astype(float),
-        body.astype(float),
-        BALL.faces.astype(np.int64),
-        sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
-    )[0].min()
 
 
 def test_a_fast_body_does_not_leave_its_garment_behind():

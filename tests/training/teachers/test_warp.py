@@ -8,7 +8,7 @@ from dataclasses import replace
 import igl
 import numpy as np
 import pytest
-from support.cloth import BALL, flag, on_ball, sheet, still
+from support.cloth import flag, on_ball, outside, sheet, still
 
 from warpgarment.errors import UsageError
 from warpgarment.objects.garment import Garment
@@ -25,16 +25,6 @@ CONVERGED = WarpSettings(iterations=150, tolerance=1e-7)
 def simulated(scene: ClothScene, settings: WarpSettings = FAST) -> np.ndarray:
     """All frames, [T, V, 3]."""
     return np.stack(list(WarpTeacher(settings).simulate(scene)))
-
-
-def outside(vertices: np.ndarray, body: np.ndarray) -> float:
-    """The least signed distance to the ball [m]."""
-    return igl.signed_distance(
-        vertices.astype(float),
-        body.astype(float),
-        BALL.faces.astype(np.int64),
-        sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL,
-    )[0].min()
 
 
 def test_known_answers():

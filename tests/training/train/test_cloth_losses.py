@@ -55,7 +55,7 @@ def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def test_terms_are_those_of_their_formulas():
     """A term has a wrong mean, sign, unit or moment: against float64 twins, one face and one edge at a time. 1e-4:
     float32 positions of strained cloth."""
-    found, faces = states(), [mesh.faces for mesh in RESTS]
+    found = states()
     expected = {name: [] for name in ALL.terms}
     for mesh, (x, recorded, now, before), m in zip(RESTS, found, MATERIALS.numpy().astype(float), strict=True):
         rest = mesh.vertices.astype(np.float64)
@@ -84,11 +84,11 @@ def test_terms_are_those_of_their_formulas():
     state = ClothState(*(points(*(one[k] for one in found)) for k in range(4)))
     values = losses()(state)
     np.testing.assert_allclose(values, [np.mean(expected[name]) for name in ALL.terms], rtol=1e-4)
-    assert len(faces) == 2
 
 
 def test_gradients_are_those_of_finite_differences():
-    """Training would go along another slope than that of its loss. 1e-3: float32."""
+    """Training would go along another slope than that of its loss. Along the way that float32 positions really went;
+    5e-3: normals are float32 and losses are curved."""
     found = states()
     state = ClothState(*(points(*(one[k] for one in found)) for k in range(4)))
     generator = torch.Generator().manual_seed(0)
@@ -97,17 +97,15 @@ def test_gradients_are_those_of_finite_differences():
         x = state.found.clone().requires_grad_()
         (gradient,) = torch.autograd.grad(cost(state._replace(found=x)).sum(), x)
         way = torch.rand(x.shape, generator=generator) * gradient.sign()
-        step = 2e-6
-        values = [cost(state._replace(found=state.found + by * way)).double().sum() for by in (step, -step)]
-        slope = float((gradient.double() * way).sum())
-        moved = float(((state.found + step * way).double() - (state.found - step * way).double()).abs().max())
-        assert moved > 0
-        assert slope == pytest.approx(float(values[0] - values[1]) / (2 * step), rel=2e-2), name
+        ends = [state.found + by * way for by in (1e-5, -1e-5)]
+        values = [cost(state._replace(found=end)).double().sum() for end in ends]
+        expected = float((gradient.double() * (ends[0].double() - ends[1].double())).sum())
+        assert expected == pytest.approx(float(values[0] - values[1]), rel=5e-3), name
 
 
 def test_free_fall_is_where_the_potential_is_least():
     """Cloth would be pulled elsewhere than where it falls: for rest shapes in flight the gradient vanishes at
-    2 x - x' + g h^2, to 1e-4 of that a tenth of the fall away."""
+    2 x - x' + g h^2, to 1e-3 (float32 positions) of that a tenth of the fall away."""
     cost = losses(ClothLossConfig(physics=1.0))
     now = points(*(mesh.vertices for mesh in RESTS))
     before = now - torch.tensor([0.01, 0.02, -0.005])
