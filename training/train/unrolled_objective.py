@@ -30,6 +30,7 @@ and the pool work as in one-step training; changes of size are not possible. Bat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -50,6 +51,7 @@ from .cloth_losses import ClothLossConfig, ClothLosses, ClothState
 from .losses import LossConfig, weighted
 
 MOST_STEPS = 8  # largest K
+KNOWN = 5e-3  # metres: e, an error that is small enough anywhere
 FIGURES = ("loss", "loss_deformation", "loss_singular_values", "loss_velocity", "position_m")
 
 
@@ -62,20 +64,26 @@ class UnrollConfig:
         position: Weight of the position loss [1/m]; 0 for none. At 2000 it is most of the loss. It is the error of
             rollouts, while the other terms count every wrinkle.
         collision_passes: Largest number of collision refinements between steps; 0 for none. A rollout has up to four.
+        floor: Distance of the teacher from its own twin for each metre between cloth and body, without unit. A vertex
+            at distance d counts e / (floor d + e) in the position loss, with e of 5 mm: where the recording itself is
+            chance, it counts less. 0: all count the same.
+        sliding: Whether gradients take the nearest body point as one that slides along its face, see
+            `warpgarment.sim.stages.features.Features`.
     """
 
     steps: int = 1
     position: float = 2000.0
     collision_passes: int = 1
+    floor: float = 0.0
+    sliding: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MOST_STEPS:
             raise ValueError(f"unroll.steps must lie between 1 and {MOST_STEPS}, got {self.steps}")
-        if self.position < 0.0 or self.collision_passes < 0:
-            raise ValueError(
-                "unroll.position and unroll.collision_passes must not be negative, got "
-                f"{self.position} and {self.collision_passes}"
-            )
+        given = {"position": self.position, "collision_passes": self.collision_passes, "floor": self.floor}
+        for name, value in given.items():
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"unroll.{name} must be at least 0 and finite, got {value}")
 
 
 class UnrolledObjective(nn.Module):
@@ -115,18 +123,20 @@ class UnrolledObjective(nn.Module):
 
     def forward(self, batch: UnrolledBatch) -> torch.Tensor:
         """The numbers named in `figures`: the total and its three terms, as means over the steps, the mean distance of
-        predicted from recorded vertices [m], and the terms of the cloth. Without a weight for that distance or for the
-        cloth, the last step is not solved and not in its mean."""
+        predicted from recorded vertices [m], each as much as it counts, and the terms of the cloth. Without a weight for
+        that distance or for the cloth, the last step is not solved and not in its mean."""
         found, distances, looks = [], [], []
         fps, before, now = self.network.config.fps, batch.before, batch.vertices
         cloth = None
         if self.cloth.terms:
             cloth = ClothLosses(self.cloth, batch.scene.packed, batch.materials, fps, batch.counted)
+        batch.scene.features.sliding = self.unroll.sliding
+        weight = batch.vertex_weight * certainty(batch, self.unroll.floor)
         for terms, vertices, recorded in self.steps(batch):
             found.append(terms)
             if vertices is None:
                 continue
-            distances.append(((vertices - recorded).norm(dim=1) * batch.vertex_weight).sum())
+            distances.append(((vertices - recorded).norm(dim=1) * weight).sum())
             if cloth is not None:
                 looks.append(cloth(ClothState(vertices, recorded, now, before)))
             before, now = now, vertices
@@ -231,3 +241,15 @@ class UnrolledObjective(nn.Module):
             component_weight = component_weight * view.component_mask
         losses = weighted(ran.normalised, ran.target, self.network, self.config, face_weight, component_weight)
         return ran.output, torch.stack(losses)
+
+
+def certainty(batch: UnrolledBatch, floor: float) -> torch.Tensor:
+    """How much a vertex counts in the position loss, e / (floor d + e), by the mean distance d of its faces from the
+    body in the last known frame; float32 [V]."""
+    faces = batch.scene.packed.faces.long()
+    outside = batch.features[:, LAYOUT["signed_distance"]].detach().clamp(min=0.0)
+    around = outside.new_zeros(len(batch.vertices), 2)
+    for corner in faces.T:
+        around.index_add_(0, corner, torch.cat([outside, torch.ones_like(outside)], dim=1))
+    distance = around[:, 0] / around[:, 1].clamp(min=1.0)
+    return KNOWN / (floor * distance + KNOWN)

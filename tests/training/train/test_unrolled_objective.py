@@ -7,6 +7,7 @@ import json
 import typing
 from pathlib import Path
 
+import igl
 import numpy as np
 import pytest
 import torch
@@ -328,6 +329,45 @@ def test_both_begin_with_the_same_history(loaded, network, t):
         torch.testing.assert_close(*lengths, rtol=0, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
 
 
+def test_cloth_far_from_the_body_counts_less(loaded, network):
+    """The position loss weighs vertices otherwise than it says: against distances to the body by brute force, and the
+    loss itself as the weighted mean. 1e-4: distances of float32, to faces and not through the cache."""
+    batch = batch_of(loaded, network, [(0, T), (1, T)], steps=1)
+    garments, bodies = [loaded[s].source.garment for s in (0, 1)], [loaded[s].source.body() for s in (0, 1)]
+    wanted = []
+    for s, (garment, body) in enumerate(zip(garments, bodies, strict=True)):
+        recorded = np.asarray(loaded[s].source.vertices[T], np.float64)
+        middles = recorded[garment.faces].mean(axis=1)
+        solid = body.vertices[T].astype(np.float64), body.faces.astype(np.int64)
+        outside = igl.signed_distance(middles, *solid)[0] > 0.0  # its lengths are up to 0.03 mm off
+        distance = np.sqrt(igl.point_mesh_squared_distance(middles, *solid)[0]) * outside
+        counts = np.bincount(garment.faces.ravel(), minlength=len(recorded))
+        total = np.bincount(garment.faces.ravel(), np.repeat(distance, 3), len(recorded))
+        wanted.append(0.005 / (0.2 * total / np.maximum(counts, 1) + 0.005))
+    weights = np.concatenate(wanted)
+    assert weights.min() < 0.9 * weights.max()
+    np.testing.assert_allclose(unroll.certainty(batch, 0.2).numpy(), weights, rtol=1e-4)
+    assert (unroll.certainty(batch, 0.0) == 1.0).all()
+
+    objective = objective_of(network, steps=1, position=1.0, floor=0.2)
+    with torch.no_grad():
+        found = objective(batch)[4]
+        ((_, vertices, recorded),) = objective.steps(batch)
+    apart = (vertices - recorded).norm(dim=1).double() * torch.from_numpy(weights) * batch.vertex_weight
+    assert float(found) == pytest.approx(float(apart.sum()), rel=1e-4)
+
+
+def test_gradients_slide_along_the_body_if_asked(loaded, network):
+    """The setting does not reach the features, so that both gradients are the same."""
+    slopes = []
+    for sliding in (False, True):
+        batch = batch_of(loaded, network, [(0, T)], steps=2)
+        network.zero_grad()
+        objective_of(network, steps=2, position=1.0, sliding=sliding)(batch)[0].backward()
+        slopes.append(network.face_head.weight.grad.clone())
+    assert (slopes[0] - slopes[1]).abs().max() > 1e-6 * slopes[0].abs().max()
+
+
 def test_samples_end_where_the_recording_does(loaded, network):
     """The last step of a sample would lie after the last recorded frame."""
     builder = UnrolledBuilder(loaded, network, QUIET, PLAIN, 3, 0)
@@ -341,8 +381,10 @@ def test_settings_that_do_not_go_together_are_refused(data, tmp_path):
     """A run would silently train otherwise than asked."""
     with pytest.raises(ValueError, match="between 1 and"):
         UnrollConfig(steps=0)
-    with pytest.raises(ValueError, match="must not be negative"):
+    with pytest.raises(ValueError, match=r"unroll\.position must be at least 0 and finite, got -1"):
         UnrollConfig(position=-1.0)
+    with pytest.raises(ValueError, match=r"unroll\.floor must be at least 0 and finite, got inf"):
+        UnrollConfig(floor=float("inf"))
     with pytest.raises(ValueError, match="leave out compile"):
         config_for(data, tmp_path, unroll=UnrollConfig(steps=2), compile=True)
     with pytest.raises(ValueError, match=r"augmentation\.scale"):
