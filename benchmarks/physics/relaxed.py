@@ -24,7 +24,7 @@ from warpgarment.sim.simulator import Simulator
 from warpgarment.training.evaluate.shape import Shape
 from warpgarment.view.markdown import table
 
-TRIED = ((0, 1.0), (3, 1.0), (8, 1.0), (8, 10.0), (8, 100.0))  # iterations and pull
+TRIED = ((0, 1.0), (4, 1600.0), (8, 1.0), (8, 100.0), (8, 1600.0), (8, 6400.0))  # iterations and pull
 HEADINGS = (
     "garment",
     "iterations",

@@ -123,8 +123,8 @@ class UnrolledObjective(nn.Module):
 
     def forward(self, batch: UnrolledBatch) -> torch.Tensor:
         """The numbers named in `figures`: the total and its three terms, as means over the steps, the mean distance of
-        predicted from recorded vertices [m], each as much as it counts, and the terms of the cloth. Without a weight for
-        that distance or for the cloth, the last step is not solved and not in its mean."""
+        predicted from recorded vertices [m], each as much as it counts, and the terms of the cloth. Without a weight
+        for that distance or for the cloth, the last step is not solved and not in its mean."""
         found, distances, looks = [], [], []
         fps, before, now = self.network.config.fps, batch.before, batch.vertices
         cloth = None

@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import igl
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from warpgarment.training.data.encoding import boxed
 from warpgarment.training.data.sequence import Sequence, list_sequences
 from warpgarment.training.data.verify import verify
 from warpgarment.training.evaluate.shape import DIFFERENCE, LOOKS
-from warpgarment.training.evaluate.twins.__main__ import TwinsConfig, main, make_twins, simulated
+from warpgarment.training.evaluate.twins.__main__ import TwinsConfig, floor_slope, main, make_twins, simulated
 from warpgarment.training.evaluate.twins.scene import TwinError, noisy, scene_of
 from warpgarment.training.evaluate.twins.stored import read_twin, shape_of
 from warpgarment.training.generate.recipes import GenerateConfig
@@ -200,3 +201,17 @@ def test_a_simulation_that_fails_leaves_no_twin(data):
     with pytest.raises(TwinError, match="not finite"):
         make_twins(TwinsConfig(data, check=0), make=lambda name, device: failing)
     assert not list((data / "twins").glob("*"))
+
+
+def test_slope_of_the_floor_is_that_of_a_line(made):
+    """The factor for --unroll.floor is not the twin's distance for each metre from the body: a twin that is 0.3 of that
+    distance away, which libigl measures, has 0.3. 1e-4: its distances are float64."""
+    sequence = Sequence.load(next(iter(list_sequences(made, "test"))))
+    recorded, body = np.array(sequence.vertices), sequence.body()
+    away = np.zeros_like(recorded)
+    for t, frame in enumerate(recorded):
+        solid = body.vertices[t].astype(np.float64), body.faces.astype(np.int64)
+        outside = igl.signed_distance(frame.astype(np.float64), *solid)[0] > 0.0
+        away[t, :, 1] = 0.3 * outside * np.sqrt(igl.point_mesh_squared_distance(frame.astype(np.float64), *solid)[0])
+    assert floor_slope(recorded, recorded + away, body) == pytest.approx(0.3, rel=1e-4)
+    assert floor_slope(recorded, recorded, body) == 0.0

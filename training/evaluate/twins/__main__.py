@@ -20,9 +20,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.outputs import check_writable
+from warpgarment.kernels.sdf.query import signed_distance
+from warpgarment.objects.body import BodyMotion
 from warpgarment.training.data.sequence import Sequence, list_sequences
 from warpgarment.training.data.splits import evenly
 from warpgarment.training.teachers import ClothScene, Teacher, TeacherError, make_teacher
@@ -145,7 +148,24 @@ def _make(path: Path, sequence: Sequence, teacher: Teacher, config: TwinsConfig)
     settings = json.loads(json.dumps(teacher.settings()))
     write_twin(path, sequence, twin, settings, noise=config.noise, seed=config.seed, replay=replay)
     distance = 100 * np.linalg.norm(twin.astype(np.float64) - recorded, axis=-1).mean(axis=1)
-    return f"{distance.mean():.3f} cm from its twin, {distance[-30:].mean():.3f} in the last 30 frames"
+    slope = floor_slope(recorded, twin, sequence.body())
+    return (
+        f"{distance.mean():.3f} cm from its twin, {distance[-30:].mean():.3f} in the last 30 frames; "
+        f"{slope:.3f} of the distance to the body (--unroll.floor)"
+    )
+
+
+def floor_slope(recorded: np.ndarray, twin: np.ndarray, body: BodyMotion) -> float:
+    """How far the twin is from the recording for each metre between cloth and body, without unit: the line through the
+    origin with the least squares, over the second half, every fifth frame."""
+    products, squares = 0.0, 0.0
+    faces = torch.from_numpy(np.asarray(body.faces, np.int32))
+    for t in range(len(recorded) // 2, min(len(recorded), body.frames), 5):
+        points, solid = (torch.tensor(np.asarray(x, np.float32)) for x in (recorded[t], body.vertices[t]))
+        outside = signed_distance(points, solid, faces)[0].double().clamp(min=0.0).numpy()
+        products += float(outside @ np.linalg.norm(twin[t].astype(np.float64) - recorded[t], axis=1))
+        squares += float(outside @ outside)
+    return products / squares if squares else 0.0
 
 
 def main(arguments: list[str] | None = None) -> int:
