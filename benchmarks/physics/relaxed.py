@@ -24,11 +24,11 @@ from warpgarment.sim.simulator import Simulator
 from warpgarment.training.evaluate.shape import Shape
 from warpgarment.view.markdown import table
 
-TRIED = ((0, 1.0), (4, 1600.0), (8, 1.0), (8, 100.0), (8, 1600.0), (8, 6400.0))  # iterations and pull
+TRIED = ((0, 1.0), (4, 0.3), (8, 0.2), (8, 0.3), (8, 0.45), (8, 0.7))  # iterations and length [m]
 HEADINGS = (
     "garment",
     "iterations",
-    "pull",
+    "length m",
     "error cm",
     "bending",
     "strain 1st %",
@@ -53,8 +53,8 @@ def main() -> None:
         seen = {key: np.nanmean(values) for key, values in shape.looks(recorded).items()}
         rows.append([name, "recording", "", "", "1.00", *(f"{100 * seen[k]:.1f}" for k in ("strain_1", "strain_99"))])
         rows[-1] += ["1.00", "", ""]
-        for iterations, pull in TRIED:
-            network.config = dataclasses.replace(network.config, physics=iterations, physics_pull=pull)
+        for iterations, length in TRIED:
+            network.config = dataclasses.replace(network.config, physics=iterations, physics_length=length)
             simulator = Simulator(network, "cpu")
             moved = simulator.rollout(item.garment, bundle.body, first_vertices=recorded[0]).vertices[: len(recorded)]
             looks = {key: np.nanmean(values) for key, values in shape.looks(moved).items()}
@@ -65,7 +65,7 @@ def main() -> None:
             each = 1e3 / (len(moved) - 1)
             times = dict(simulator.timings)
             cells += [f"{each * times.get('physics', 0.0):.1f}", f"{each * sum(times.values()):.1f}"]
-            rows.append([name, str(iterations), f"{pull:g}" if iterations else "", *cells])
+            rows.append([name, str(iterations), f"{length:g}" if iterations else "", *cells])
             print("  ".join(rows[-1]), flush=True)
     about = ", ".join(f"{k} {v}" for k, v in machine(torch.device("cpu")).items())
     lines = [

@@ -16,6 +16,9 @@ in metres: what an implicit Euler step of the cloth minimises, of the duration h
 integrator for large time steps", 2015; as a loss: Santesteban, Otaduy and Casas, "SNUG", 2022). The states before are
 constants in it. It knows no air, and no contact: the positions are those after the collision passes, and where these
 move a vertex, the gradient is theirs.
+
+In a network with the physics stage, M is the energy before the stage, which folds what the network squeezes: the strain
+that is left after it says little of how much that was.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ import torch
 
 from warpgarment.kernels.deformation.gradients import face_normals
 from warpgarment.kernels.physics import PhysicsCloth
-from warpgarment.kernels.physics.energies import cloth_energies
+from warpgarment.kernels.physics.energies import ClothEnergies, cloth_energies
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.stages.relax import sheets_of
 
@@ -70,6 +73,7 @@ class ClothState(NamedTuple):
     recorded: torch.Tensor
     now: torch.Tensor  # the predicted state before
     before: torch.Tensor  # the one before that
+    solved: torch.Tensor | None = None  # predicted, before the stage of `sim/stages/relax.py`; None without one
 
 
 class ClothLosses:
@@ -112,10 +116,13 @@ class ClothLosses:
         every = {
             "normal": lambda: self._mean(self._normals(state)),
             "bending": lambda: self._mean(_ratio(predicted.bending, wanted.bending, self._bent)),
-            "membrane": lambda: self._mean(_ratio(predicted.membrane, wanted.membrane, self._strained)),
+            "membrane": lambda: self._mean(_ratio(self._membrane(state, predicted), wanted.membrane, self._strained)),
             "physics": lambda: (self._potential(state, predicted.membrane + predicted.bending)).mean(),
         }
         return torch.stack([every[name]() for name in self.config.terms]).float()
+
+    def _membrane(self, state: ClothState, predicted: ClothEnergies) -> torch.Tensor:
+        return predicted.membrane if state.solved is None else cloth_energies(state.solved, self._cloth).membrane
 
     def _mean(self, values: torch.Tensor) -> torch.Tensor:
         """Mean of values of garments [B], of which those without a recording are zero."""

@@ -47,7 +47,7 @@ from .training_set import NoTrainingData, load_sequences, load_validation, repor
 __all__ = ["CompileFailed", "GroupError", "NoTrainingData", "NonFiniteLoss", "Run", "TrainConfig", "train"]
 
 
-WITHOUT_WEIGHTS = ("physics", "physics_pull")  # settings that a trained network can be given
+WITHOUT_WEIGHTS = ("physics", "physics_length")  # settings that a trained network can be given
 KEPT = 10  # times the weights: those of two networks, and a state of four sets, written beside the old one
 
 

@@ -33,6 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import nn
@@ -86,6 +87,15 @@ class UnrollConfig:
                 raise ValueError(f"unroll.{name} must be at least 0 and finite, got {value}")
 
 
+class StepTaken(NamedTuple):
+    """A step of a sample; positions in metres, [V,3] each."""
+
+    terms: torch.Tensor  # the losses [4] of `losses.Losses`
+    vertices: torch.Tensor | None  # predicted; None for the last step, if they are not needed
+    recorded: torch.Tensor
+    solved: torch.Tensor | None  # predicted, before the physics stage; None without one
+
+
 class UnrolledObjective(nn.Module):
     """Loss of a batch of unrolled samples.
 
@@ -132,13 +142,13 @@ class UnrolledObjective(nn.Module):
             cloth = ClothLosses(self.cloth, batch.scene.packed, batch.materials, fps, batch.counted)
         batch.scene.features.sliding = self.unroll.sliding
         weight = batch.vertex_weight * certainty(batch, self.unroll.floor)
-        for terms, vertices, recorded in self.steps(batch):
+        for terms, vertices, recorded, solved in self.steps(batch):
             found.append(terms)
             if vertices is None:
                 continue
             distances.append(((vertices - recorded).norm(dim=1) * weight).sum())
             if cloth is not None:
-                looks.append(cloth(ClothState(vertices, recorded, now, before)))
+                looks.append(cloth(ClothState(vertices, recorded, now, before, solved)))
             before, now = now, vertices
         terms = torch.stack(found).mean(dim=0)
         position = torch.stack(distances).mean() if distances else terms.new_zeros(())
@@ -147,9 +157,8 @@ class UnrolledObjective(nn.Module):
         total = total + sum(getattr(self.cloth, name) * term for name, term in zip(self.cloth.terms, seen, strict=True))
         return torch.stack([total, *terms[1:], position if self.unroll.position else position.detach(), *seen])
 
-    def steps(self, batch: UnrolledBatch) -> Iterator[tuple[torch.Tensor, torch.Tensor | None, torch.Tensor]]:
-        """Yields for each step the losses [4] of `losses.Losses`, the predicted vertices [V,3] (None for the last step,
-        if they are not needed) and the recorded ones."""
+    def steps(self, batch: UnrolledBatch) -> Iterator[StepTaken]:
+        """Yields the steps."""
         scene, config = batch.scene, self.network.config
         vertices, history, features = batch.vertices, batch.history, batch.features
         before, packed = batch.before, scene.packed
@@ -170,17 +179,17 @@ class UnrolledObjective(nn.Module):
             output, terms = self._network(batch, stacked.flatten(1), history.velocities.flatten(1), outside, target)
             last = k + 1 == len(batch.recorded)
             if last and not self.unroll.position and not self.cloth.terms:
-                yield terms, None, recorded
+                yield StepTaken(terms, None, recorded, None)
                 return
             body = batch.bodies[k + 1]
             solved, finite = scene.reconstruct(
                 vertices, compose(output, newest, residual=config.residual), features, body
             )
-            solved = scene.relax(solved, finite)
+            before_stage, solved = solved, scene.relax(solved, finite)
             if self.unroll.collision_passes:
                 origin = scene.contact.origin(vertices, features)
                 solved = scene.contact(solved, body, finite, origin, measure=False)[0]
-            yield terms, solved, recorded
+            yield StepTaken(terms, solved, recorded, before_stage if scene.relax.on else None)
             if not last:
                 velocity = scene.centroids(solved) - scene.centroids(vertices)
                 history = history.followed(stacked, velocity)

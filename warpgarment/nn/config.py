@@ -62,7 +62,7 @@ class NetworkConfig:
     face_layers: int = 2  # number of face layers after the patches; there is one more before them
     channels: tuple[str, ...] = CHANNELS  # features of a face that the network reads, see kernels/features/channels.py
     physics: int = 0  # iterations of the cloth's own physics after the Poisson solve: sim/stages/relax.py
-    physics_pull: float = 1.0  # weight of the predicted positions in them
+    physics_length: float = 0.25  # metres: shorter waves of the cloth are the physics', longer ones the network's
     outdoor: tuple[str, ...] = ()  # channels of material and wind that it reads too: kernels/features/outdoor.py
 
     def __post_init__(self) -> None:
@@ -81,7 +81,7 @@ class NetworkConfig:
             raise ValueError(f"face_layers must not be negative, got {self.face_layers}")
         if self.physics < 0:
             raise ValueError(f"physics must not be negative, got {self.physics}")
-        for name in ("geodesic_power", "geodesic_radius", "fps", "patch_spacing", "physics_pull"):
+        for name in ("geodesic_power", "geodesic_radius", "fps", "patch_spacing", "physics_length"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
         if self.heading not in ("world", "canonical"):
@@ -112,7 +112,7 @@ class NetworkConfig:
         if not self.outdoor:
             del values["outdoor"]
         if not self.physics:
-            del values["physics"], values["physics_pull"]
+            del values["physics"], values["physics_length"]
         return values
 
     @classmethod

@@ -143,7 +143,7 @@ class Scene:
         )
         config = network.config
         iterations = config.physics if physics is None else physics
-        self.relax = Relax(packed, iterations, config.physics_pull, config.fps, materials, timings)
+        self.relax = Relax(packed, iterations, config.physics_length, materials, timings)
         self.contact = Contact(
             packed,
             Surface(garments, packed),

@@ -162,7 +162,7 @@ def test_unrolled_states_are_those_of_the_simulator(data, config, t):
         batch = builder.build([(k, t)], None, np.random.default_rng(4))
         with torch.no_grad():
             objective = UnrolledObjective(network, LossConfig(), 0.0, "float32", unroll)
-            states = torch.stack([vertices for _, vertices, _ in objective.steps(batch)]).numpy()
+            states = torch.stack([step.vertices for step in objective.steps(batch)]).numpy()
         expected = predict(simulator, loaded[k].source, t, 3, cold=t == 0)
         np.testing.assert_allclose(states, expected, atol=1e-5)
         whole = predict(simulator, Sequence.load(data / "a"), t, 3, cold=t == 0)

@@ -86,6 +86,15 @@ def test_terms_are_those_of_their_formulas():
     np.testing.assert_allclose(values, [np.mean(expected[name]) for name in ALL.terms], rtol=1e-4)
 
 
+def test_the_membrane_is_that_before_the_physics_stage():
+    """A network would not be told that it squeezes cloth, since the stage folds what it squeezed."""
+    found = states()
+    state = ClothState(*(points(*(one[k] for one in found)) for k in range(4)))
+    cost, squeezed = losses(ClothLossConfig(membrane=1.0)), state.found * torch.tensor([1.0, 0.9, 1.0])
+    torch.testing.assert_close(cost(state._replace(solved=squeezed)), cost(state._replace(found=squeezed)))
+    assert cost(state._replace(solved=squeezed)) > 1.1 * cost(state)
+
+
 def test_gradients_are_those_of_finite_differences():
     """Training would go along another slope than that of its loss. Along the way that float32 positions really went;
     5e-3: normals are float32 and losses are curved."""

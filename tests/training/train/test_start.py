@@ -224,9 +224,9 @@ def test_overrides_of_a_trained_network_are_taken_or_refused(data, whole, tmp_pa
     """`--init` with `--overrides physics=8` trains without physics, and one with `heads=4` with the old heads; neither
     with a word."""
     init = {"init": whole / "network.safetensors", "steps": 1, "validate_sequences": 0, "pushforward": QUIET}
-    physics = (*SHAPE, "physics=3", "physics_pull=50")
+    physics = (*SHAPE, "physics=3", "physics_length=0.5")
     train.train(config_for(data, tmp_path / "physics", overrides=physics, **init))
     made = checkpoint.load(tmp_path / "physics" / "network.safetensors").config
-    assert (made.physics, made.physics_pull) == (3, 50.0)
+    assert (made.physics, made.physics_length) == (3, 0.5)
     with pytest.raises(UsageError, match="layers=2, but the network from init has 1"):
         train.train(config_for(data, tmp_path / "layers", overrides=("layers=2",), **init))

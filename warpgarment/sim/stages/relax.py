@@ -2,16 +2,19 @@
 
 Networks lose folds: they squeeze cloth where it should bend. From the solved positions V⁰ the stage lowers
 
-    ½ c Σ m |V - V⁰|² + membrane + bending,    c = pull / h²
+    ½ (2π / L)² Σ k a |V - V⁰|² + membrane + bending
 
-by L-BFGS (`warpgarment.kernels.physics`), with h the duration of a frame. Against these energies the first term is weak
-for short waves and strong for long ones: cloth keeps its place and gets its lengths back. Pins stay. The gradient is
-that of the identity: networks can be trained with the stage, past it.
+by L-BFGS (`warpgarment.kernels.physics`). A wave of length l in a membrane of stiffness k has the energy of the first
+term with l in place of L. So of waves longer than L the network decides and of shorter ones the physics, whatever the
+cloth is made of: it keeps its place and gets its lengths back. Pins stay. The gradient is that of the identity:
+networks can be trained with the stage, past it.
 
 | symbol | code | what |
 | --- | --- | --- |
 | V⁰ | `solved` | positions after the Poisson solve [m] |
-| m | `PhysicsCloth.mass` | mass of a vertex [kg] |
+| L | `length` | length of waves for which both terms are equal [m] |
+| k | `Sheet.stiffness` | stiffness of the membrane along a thread [N/m] |
+| a | | area of a vertex, a third of those of its faces [m²] |
 """
 
 from __future__ import annotations
@@ -38,8 +41,7 @@ class Relax:
     Args:
         packed: The batch.
         iterations: Evaluations of energy and gradient in a frame; 0: the stage does nothing.
-        pull: Weight of the predicted positions, without unit.
-        fps: Frames per second.
+        length: Waves of the cloth longer than this are the network's, shorter ones the physics' [m].
         materials: Fields of the material of each garment, [B,M], NaN for the default material; None: all have that.
         timings: Times of the stages, to which this one adds its own as "physics".
 
@@ -51,8 +53,7 @@ class Relax:
         self,
         packed: PackedGarments,
         iterations: int,
-        pull: float,
-        fps: float,
+        length: float,
         materials: torch.Tensor | None,
         timings: Timings,
     ) -> None:
@@ -63,10 +64,17 @@ class Relax:
         held = np.zeros(len(rest), bool)
         held[packed.pins.cpu().numpy()] = True
         owner = packed.garment_of_face.cpu().numpy()
-        sheets = sheets_of(materials, packed.count)
+        sheets = [
+            sheet._replace(density=sheet.stiffness[:2, :2].trace() / 2.0)
+            for sheet in sheets_of(materials, packed.count)
+        ]
         cloth = PhysicsCloth.build(rest, faces, np.array(packed.vertex_offsets), sheets, owner, packed.faces.device)
         self._solver = ImplicitSolver(
-            cloth, inertia=pull * fps**2, iterations=iterations + 1, held=held, memory=min(MEMORY, iterations)
+            cloth,
+            inertia=(2.0 * np.pi / length) ** 2,
+            iterations=iterations + 1,
+            held=held,
+            memory=min(MEMORY, iterations),
         )
 
     def __call__(self, solved: torch.Tensor, finite: torch.Tensor) -> torch.Tensor:
