@@ -29,6 +29,7 @@ from warpgarment.view.markdown import table
 
 from .cases import CASES, Case
 from .environment import python_of
+from .picture import draw
 from .processes import Worker, demo_motions, fresh, trained
 
 Row = dict[str, Any]
@@ -115,6 +116,8 @@ def _row(case: Case, figures: tuple[list[float], ...]) -> Row:
     row: Row = {"what": case.what, "unit": case.unit, "rounds": len(now)}
     for name, values in (("before", before), ("now", now)):
         row |= {f"{name}_least": min(values), f"{name}_median": statistics.median(values)}
+    if case.kind == "frames" and case.share == 1 and not case.fresh:
+        row |= {"faces": case.options["faces"][0], "threads": case.threads}
     row["ratio"] = row["now_least"] / row["before_least"]
     row["ratio_of_medians"] = row["now_median"] / row["before_median"]
     return row | {"target": case.target, "met": case.target is None or row["ratio"] <= case.target}
@@ -158,6 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", default=[""], metavar="NAME", help=f"beginnings of: {names}")
     parser.add_argument("--rounds", type=int, default=60, help="largest number of turns of a row")
     parser.add_argument("--out", type=Path, help="a JSON file for the rows")
+    parser.add_argument("--picture", type=Path, help="a PNG of the times of a frame over the faces")
     options = parser.parse_args(arguments)
     builds = Builds(python_of(options.commit), Path(sys.executable))
     rows = []
@@ -171,3 +175,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"\n{about['device']}, {about['cores']} cores, torch {about['torch']}, warp-lang {about['warp-lang']}")
     if options.out:
         options.out.write_text(json.dumps({"machine": about, "against": options.commit, "rows": rows}, indent=1))
+    if options.picture:
+        draw(rows, options.picture, options.commit)

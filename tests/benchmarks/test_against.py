@@ -4,8 +4,10 @@ import subprocess
 
 import numpy as np
 import pytest
+from matplotlib import image
 
 from benchmarks.against.environment import ROOT, NoSuchCommit, python_of
+from benchmarks.against.picture import draw
 from benchmarks.against.processes import Worker, demo_motions
 
 
@@ -32,3 +34,17 @@ def test_an_unknown_commit_is_named(tmp_path):
     """A misspelt commit would be a traceback of git, or make an environment of something else."""
     with pytest.raises(NoSuchCommit, match="'0000nothing'"):
         python_of("0000nothing", tmp_path)
+
+
+def test_the_picture_has_a_line_for_each_build_and_number_of_cores(tmp_path):
+    """A line of the picture would be missing, or a broken picture would be written; rows of batches are not drawn."""
+    rows = [
+        {"what": "frame", "faces": faces, "threads": threads, "before_least": 0.02 * faces, "now_least": 0.01 * faces}
+        for faces in (10_000, 1000)
+        for threads in (1, 2)
+    ]
+    draw([*rows, {"what": "batch", "before_least": 1.0, "now_least": 1.0}], tmp_path / "times.png", "1a9fae1")
+    pixels = image.imread(tmp_path / "times.png")[..., :3]
+    assert pixels.shape[0] > 300
+    coloured = np.ptp(pixels, axis=2) > 0.3  # today's lines are blue
+    assert coloured.sum() > 500
