@@ -20,6 +20,7 @@ from warpgarment.kernels.mesh.caps import caps_of
 from . import inside, nearest_face
 from .closest import Bodies, query_bodies
 from .inside import loop_size_kernel
+from .tree import Trees, no_trees
 
 LEAF_SIZE = 2
 """Number of faces in a leaf of a hierarchy: 1, 2, 4 and 8 take 2.50, 2.33, 2.37 and 2.58 ms for 1,836 points on a
@@ -50,6 +51,8 @@ class BodyMeshes:
         faces: Packed (global) vertex indices, int32 [G, 3].
         vertex_offsets: Index at which the vertices of each body begin, and U, integers [B + 1]; None for one body.
         face_offsets: Index at which the faces of each body begin, and G, integers [B + 1]; None for one body.
+        wide: Whether nearest faces and rays are searched in trees eight wide, which works on a CPU only, or in Warp's;
+            None: on a CPU. Both find the same.
 
     Raises:
         TypeError: Wrong dtypes.
@@ -63,6 +66,8 @@ class BodyMeshes:
         faces: torch.Tensor,
         vertex_offsets: torch.Tensor | Sequence[int] | None = None,
         face_offsets: torch.Tensor | Sequence[int] | None = None,
+        *,
+        wide: bool | None = None,
     ) -> None:
         expect("body vertices", vertices, (None, 3))
         expect("body faces", faces, (None, 3), torch.int32, vertices.device)
@@ -117,6 +122,9 @@ class BodyMeshes:
         for name, (tensor, kind) in tensors.items():
             setattr(self.model, name, as_warp(tensor, kind))
         self._memory = tensors
+        wide = vertices.device.type == "cpu" if wide is None else wide
+        self._trees = Trees(self._vertices, self._faces, face_starts) if wide else None
+        self.model.tree = self._trees.model if self._trees else no_trees(vertices.device)
         self._measure_loops()
 
     @property
@@ -146,6 +154,8 @@ class BodyMeshes:
         with torch_stream(self.device):
             for mesh in self._meshes:
                 mesh.refit()
+        if self._trees:
+            self._trees.refit()
         self._measure_loops()
 
     def _measure_loops(self) -> None:

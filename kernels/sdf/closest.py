@@ -1,10 +1,11 @@
 """The closest point of a body, and the side of it that a point is on.
 
 Manifold-aware transformers, section 4.2 (s_i) and supplement equation 2; formulas in query.py. The nearest face
-comes from Warp's hierarchy, its point from nearest_face.py in float64, the sign from inside.py. Nothing of earlier
-frames is used: a perfect guess of the distance would shorten the search by a tenth only, and a result would then
-depend on more than its arguments. A limit on the distance shortens the search much more (`within`): contacts need no
-point that is further outside. Which face is named where several are equally near is decided in nearest_face.py.
+comes from the trees of tree.py on a CPU and from Warp's on a GPU, its point from nearest_face.py in float64, the sign
+from inside.py. Nothing of earlier frames is used: a perfect guess of the distance would shorten the search by a tenth
+only, and a result would then depend on more than its arguments. A limit on the distance shortens the search much more
+(`within`): contacts need no point that is further outside. Which face is named where several are equally near is
+decided in nearest_face.py.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ import warp as wp
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
-from .inside import is_inside
-from .nearest_face import corners_of, named_face, nearest_on_triangle
+from .inside import crossings, is_inside
+from .nearest_face import closest_on_triangle, corners_of, named_face, nearest_on_triangle
+from .tree import Tree
+from .tree_search import crossings_by_tree, nearest_by_tree, on_cpu
 
 MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its square is still a finite float32
 # Bodies in pieces: distance, in radii, from which a group of faces is summed as one. On closed bodies 1, 2 and 3 give
@@ -44,6 +47,37 @@ class Bodies:
     loops: wp.array[wp.int32]
     caps: wp.array[wp.vec3i]
     loop_size: wp.array[wp.vec2]
+    tree: Tree  # of all bodies; without nodes on a GPU
+
+
+@wp.func
+def has_tree(bodies: Bodies) -> bool:
+    """Whether the trees of tree.py are searched, not Warp's; false on every GPU."""
+    return on_cpu() != 0 and bodies.tree.nodes.shape[0] > 0
+
+
+@wp.func
+def found_face(bodies: Bodies, b: int, point: wp.vec3, reach: float) -> int:
+    """The face of a body, counted within it, that a search in float32 finds; NOTHING if none is nearer than `reach`."""
+    face = NOTHING
+    if has_tree(bodies):
+        face = nearest_by_tree(bodies.tree, b, point, reach)
+    else:
+        near = wp.mesh_query_point_no_sign(bodies.meshes[b], point, reach)
+        if near.result:
+            face = near.face
+    return face
+
+
+@wp.func
+def body_crossings(bodies: Bodies, b: int, point: wp.vec3, axis: int, side: float) -> int:
+    """Signed number of crossings of a ray along an axis with a body."""
+    crossed = wp.int32(0)
+    if has_tree(bodies):
+        crossed = crossings_by_tree(bodies.tree, b, point, axis, side)
+    else:
+        crossed = crossings(bodies.meshes[b], point, axis, side)
+    return crossed
 
 
 @wp.func
@@ -72,41 +106,38 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
     reach = wp.min(within, MAX_DISTANCE)
     face = NOTHING
     sign = wp.float32(1.0)
-    u = wp.float32(0.0)
-    v = wp.float32(0.0)
     if bodies.scattered[b] != 0:
         around = wp.mesh_query_point_sign_winding_number(mesh, point, MAX_DISTANCE, WINDING_ACCURACY, INSIDE)
         if around.result:
             sign = around.sign
             if sign < 0.0 or wp.length(wp.vec3d(point) - position_on(mesh, around.face, around.u, around.v)) < reach:
                 face = around.face
-                u = around.u
-                v = around.v
     else:
-        near = wp.mesh_query_point_no_sign(mesh, point, reach)
+        face = found_face(bodies, b, point, reach)
         # The ray leads away from the surface, where it meets fewer faces; any other ray gives the same sign.
         axis = wp.int32(2)
         side = wp.float32(1.0)
-        if near.result:
-            face = near.face
-            u = near.u
-            v = near.v
-            away = point - wp.vec3(position_on(mesh, face, u, v))
+        if face >= 0:
+            first, second, third = corners_of(mesh, face)
+            away = point - wp.vec3(closest_on_triangle(wp.vec3d(point), first, second, third))
             size = wp.vec3(wp.abs(away[0]), wp.abs(away[1]), wp.abs(away[2]))
             axis = wp.where(size[0] > wp.max(size[1], size[2]), 0, wp.where(size[1] > size[2], 1, 2))
             side = wp.where(away[axis] < 0.0, -1.0, 1.0)
-        first = bodies.loop_offsets[b]
-        last = bodies.loop_offsets[b + 1]
         if is_inside(
-            mesh, bodies.vertices, bodies.caps, bodies.loops, bodies.loop_size, first, last, point, axis, side
+            body_crossings(bodies, b, point, axis, side),
+            bodies.vertices,
+            bodies.caps,
+            bodies.loops,
+            bodies.loop_size,
+            bodies.loop_offsets[b],
+            bodies.loop_offsets[b + 1],
+            point,
+            axis,
+            side,
         ):
             sign = -1.0
             if face < 0:
-                deep = wp.mesh_query_point_no_sign(mesh, point, MAX_DISTANCE)
-                if deep.result:
-                    face = deep.face
-                    u = deep.u
-                    v = deep.v
+                face = found_face(bodies, b, point, MAX_DISTANCE)
     if face < 0:
         return wp.where(reach < MAX_DISTANCE, BEYOND, NOTHING), sign, nowhere, wp.vec3d(nowhere)
     # The search is in float32. Distances are flat around their minimum: where one is right to 1e-7 m, its point may be

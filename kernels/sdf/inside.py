@@ -32,7 +32,7 @@ MOST_CAPS = 512
 """Largest number of caps of a body that are searched one by one."""
 FAR = wp.constant(1.0e30)
 ZERO = wp.constant(wp.float64(0.0))
-NEGLIGIBLE = wp.constant(wp.float64(0.01))  # a loop whose winding number is below this is at first only bounded
+NEGLIGIBLE = wp.constant(wp.float64(0.2))  # a loop whose winding number is below this is at first only bounded
 ROUNDING = wp.constant(wp.float64(1.0e-6))  # rounding error of a sum of solid angles
 PER_TURN = wp.constant(wp.float64(1.0 / (4.0 * np.pi)))
 
@@ -144,7 +144,7 @@ def loop_winding(
 
 @wp.func
 def is_inside(
-    mesh: wp.uint64,
+    crossed: int,
     vertices: wp.array[wp.vec3],
     caps: wp.array[wp.vec3i],
     loops: wp.array[wp.int32],
@@ -158,7 +158,7 @@ def is_inside(
     """Whether the winding number of a body exceeds one half.
 
     Args:
-        mesh: The body.
+        crossed: Crossings of a ray from the point along an axis with the body.
         vertices: Packed vertex positions [m], [U].
         caps: Packed vertex indices of the caps, [K].
         loops: Index at which the caps of each loop begin, [L + 1].
@@ -169,7 +169,7 @@ def is_inside(
         axis: Axis of the ray, 0, 1 or 2.
         side: Direction of the ray along the axis, +1 or -1.
     """
-    winding = wp.float64(crossings(mesh, point, axis, side))
+    winding = wp.float64(crossed)
     unsure = ROUNDING
     for loop in range(first_loop, last_loop):
         first = loops[loop]
@@ -178,14 +178,14 @@ def is_inside(
         offset = vertices[caps[first][0]] - point
         distance = wp.length(offset)
         beside = distance * distance - offset[axis] * offset[axis]
-        crossed = beside <= 1.0001 * size[0] * size[0] + 1.0e-6 * distance * distance
+        on_ray = beside <= 1.0001 * size[0] * size[0] + 1.0e-6 * distance * distance
         gap = wp.float64(distance - size[0])
         bound = wp.float64(size[1]) * PER_TURN
         seen = not (gap > ZERO and bound < NEGLIGIBLE * gap * gap)
         if not seen:
             unsure += bound / (gap * gap)
-        if crossed or seen:
-            winding += loop_winding(vertices, caps, first, last, point, axis, side, crossed, seen)
+        if on_ray or seen:
+            winding += loop_winding(vertices, caps, first, last, point, axis, side, on_ray, seen)
     if wp.abs(winding - wp.float64(0.5)) <= unsure and unsure > ROUNDING:
         for loop in range(first_loop, last_loop):  # the loops that were only bounded decide
             size = loop_size[loop]

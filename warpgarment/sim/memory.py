@@ -35,7 +35,7 @@ from warpgarment.sim.stages.correct import Corrector
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
-PER_BODY_FACE, PER_BODY_VERTEX = 400, 60  # bytes of the search tree with winding numbers; of positions in two frames
+PER_BODY_FACE, PER_BODY_VERTEX = 520, 60  # bytes of Warp's tree with winding numbers and of ours; of two positions
 PER_MEETING_FACE = PARTNERS * (4 + 3 * 12) + 200  # bytes of pairs and their directions, and of boxes and a tree
 GRAPHED = 3  # copies of the history on a GPU: of a state, and the input and output of a graph
 INVERTING = 3  # number of float64 matrices while the compliance of a component is made

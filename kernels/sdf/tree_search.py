@@ -1,0 +1,340 @@
+"""Searches of the trees of tree.py: the nearest face of a point, and the crossings of a ray along an axis.
+
+A node's lanes are looked at together. Their bounds are made integers, which order like the floating-point numbers they
+are made of as long as these are not negative, with the number of the lane in the lowest three bits: the least of the
+eight is the nearest child and its bound at once. A bound loses one part in a million by that, downwards.
+
+Loops over lanes are written with `while`, since Warp would unroll a `for`, and its compiler makes vector instructions
+of loops only. The pairs of `least` and `most` are such that they become vectors, too.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from .inside import crossing, volume_of
+from .tree import FAR, Tree, vec8, vec8i
+
+NEVER = wp.constant(0x7FFFFFFF)
+LANE = wp.constant(7)
+"""The bits of a key that are a lane."""
+stack64 = wp.types.vector(length=64, dtype=wp.int32)  # seven for each level, which is enough for eight levels
+
+_ON_CPU = """
+#if defined(__CUDA_ARCH__)
+    return 0;
+#else
+    return 1;
+#endif
+"""
+
+
+@wp.func_native(_ON_CPU)
+def on_cpu() -> int:
+    """1 where kernels are compiled for a CPU. On a GPU the compiler leaves out what depends on it."""
+    ...
+
+
+@wp.func
+def least(k: vec8i):
+    a = wp.min(k[0], k[4])
+    b = wp.min(k[1], k[5])
+    c = wp.min(k[2], k[6])
+    d = wp.min(k[3], k[7])
+    a = wp.min(a, c)
+    b = wp.min(b, d)
+    return wp.min(a, b)
+
+
+@wp.func
+def most(k: vec8i):
+    a = wp.max(k[0], k[4])
+    b = wp.max(k[1], k[5])
+    c = wp.max(k[2], k[6])
+    d = wp.max(k[3], k[7])
+    a = wp.max(a, c)
+    b = wp.max(b, d)
+    return wp.max(a, b)
+
+
+@wp.func
+def least_above(keys: vec8i, last: int):
+    """The least key that is larger than `last`, or NEVER."""
+    m = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        m[r] = wp.where(keys[r] > last, keys[r], NEVER)
+        r += 1
+    return least(m)
+
+
+@wp.func
+def most_below(keys: vec8i, first: int):
+    """The largest key that is smaller than `first`, or -1."""
+    m = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        m[r] = wp.where(keys[r] < first, keys[r], -1)
+        r += 1
+    return most(m)
+
+
+@wp.func
+def lane_of(keys: vec8i, key: int):
+    """The first lane with this key."""
+    m = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        m[r] = wp.where(keys[r] == key, r, 7)
+        r += 1
+    return least(m)
+
+
+@wp.func
+def distances_to_boxes(boxes: wp.array2d[vec8], node: int, px: float, py: float, pz: float):
+    """Keys of the children of a node: squared distances of their boxes from a point."""
+    lx = boxes[node, 0]
+    ly = boxes[node, 1]
+    lz = boxes[node, 2]
+    hx = boxes[node, 3]
+    hy = boxes[node, 4]
+    hz = boxes[node, 5]
+    keys = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        x0 = lx[r] - px
+        x1 = px - hx[r]
+        y0 = ly[r] - py
+        y1 = py - hy[r]
+        z0 = lz[r] - pz
+        z1 = pz - hz[r]
+        x = wp.where(x0 > x1, x0, x1)
+        y = wp.where(y0 > y1, y0, y1)
+        z = wp.where(z0 > z1, z0, z1)
+        x = wp.where(x > 0.0, x, 0.0)
+        y = wp.where(y > 0.0, y, 0.0)
+        z = wp.where(z > 0.0, z, 0.0)
+        keys[r] = (wp.cast(x * x + y * y + z * z, wp.int32) & ~LANE) | r
+        r += 1
+    return keys
+
+
+@wp.func
+def distances_to_triangles(frames: wp.array2d[vec8], leaf: int, px: float, py: float, pz: float):
+    """Squared distances of a point from the triangles of a leaf [m²], as bits.
+
+    In the frame of a triangle this is z² + 0 inside, else z² and the least squared distance from the three edges.
+    """
+    ox = frames[leaf, 0]
+    oy = frames[leaf, 1]
+    oz = frames[leaf, 2]
+    xx = frames[leaf, 3]
+    xy = frames[leaf, 4]
+    xz = frames[leaf, 5]
+    yx = frames[leaf, 6]
+    yy = frames[leaf, 7]
+    yz = frames[leaf, 8]
+    zx = frames[leaf, 9]
+    zy = frames[leaf, 10]
+    zz = frames[leaf, 11]
+    length = frames[leaf, 12]
+    along = frames[leaf, 13]
+    across = frames[leaf, 14]
+    per_ac = frames[leaf, 15]
+    per_bc = frames[leaf, 16]
+    bits = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        qx = px - ox[r]
+        qy = py - oy[r]
+        qz = pz - oz[r]
+        x = qx * xx[r] + qy * xy[r] + qz * xz[r]
+        y = qx * yx[r] + qy * yy[r] + qz * yz[r]
+        z = qx * zx[r] + qy * zy[r] + qz * zz[r]
+        l = length[r]
+        cx = along[r]
+        cy = across[r]
+        bx = cx - l
+        u = x - l
+        # From ab, ac, bc.
+        t = wp.where(x > 0.0, x, 0.0)
+        t = wp.where(t < l, t, l)
+        nearest = (x - t) * (x - t) + y * y
+        t = (x * cx + y * cy) * per_ac[r]
+        t = wp.where(t > 0.0, t, 0.0)
+        t = wp.where(t < 1.0, t, 1.0)
+        dx = x - t * cx
+        dy = y - t * cy
+        d = dx * dx + dy * dy
+        nearest = wp.where(nearest < d, nearest, d)
+        t = (u * bx + y * cy) * per_bc[r]
+        t = wp.where(t > 0.0, t, 0.0)
+        t = wp.where(t < 1.0, t, 1.0)
+        dx = u - t * bx
+        dy = y - t * cy
+        d = dx * dx + dy * dy
+        nearest = wp.where(nearest < d, nearest, d)
+        # Inside all three edges?
+        s = cy * x - cx * y
+        t = bx * y - cy * u
+        s = wp.where(s < t, s, t)
+        s = wp.where(s < y, s, y)
+        nearest = wp.where(s > 0.0, 0.0, nearest)
+        d = nearest + z * z
+        bits[r] = wp.cast(wp.where(d < FAR * FAR, d, FAR * FAR), wp.int32)
+        r += 1
+    return bits
+
+
+@wp.func
+def nearest_by_tree(tree: Tree, b: int, point: wp.vec3, reach: float) -> int:
+    """The face of a body, counted within it, that is nearest to a point; -1 if none is nearer than `reach` [m].
+
+    Nodes are kept on a stack, the nearest on top, and children of the last level are looked at in the order of their
+    distance, up to the least distance that was found so far.
+    """
+    px = point[0]
+    py = point[1]
+    pz = point[2]
+    best = wp.cast(reach * reach, wp.int32)
+    face = wp.int32(-1)
+    nodes = stack64()
+    bounds = stack64()
+    nodes[0] = tree.nodes[b]
+    top = wp.int32(1)
+    while top > 0:
+        top -= 1
+        if bounds[top] < best:
+            node = nodes[top]
+            keys = distances_to_boxes(tree.boxes, node, px, py, pz)
+            first = tree.children[node]
+            if first < 0:
+                key = least(keys)
+                while key < best:
+                    leaf = ~first + (key & LANE)
+                    bits = distances_to_triangles(tree.frames, leaf, px, py, pz)
+                    found = least(bits)
+                    if found < best:
+                        best = found
+                        face = tree.faces[leaf][lane_of(bits, found)]
+                    key = least_above(keys, key)
+            else:
+                key = most_below(keys, best)
+                while key >= 0:
+                    nodes[top] = first + (key & LANE)
+                    bounds[top] = key & ~LANE
+                    top += 1
+                    key = most_below(keys, key)
+    return face
+
+
+@wp.func
+def boxes_on_ray(boxes: wp.array2d[vec8], node: int, along: float, pu: float, pv: float, axis: int, side: float):
+    """Lanes of the children of a node whose boxes a ray along an axis meets, NEVER elsewhere."""
+    u = (axis + 1) % 3
+    v = (axis + 2) % 3
+    lu = boxes[node, u]
+    hu = boxes[node, u + 3]
+    lv = boxes[node, v]
+    hv = boxes[node, v + 3]
+    end = boxes[node, wp.where(side > 0.0, axis + 3, axis)]
+    lanes = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        # The least of all margins.
+        m = pu - lu[r]
+        n = hu[r] - pu
+        m = wp.where(m < n, m, n)
+        n = pv - lv[r]
+        m = wp.where(m < n, m, n)
+        n = hv[r] - pv
+        m = wp.where(m < n, m, n)
+        n = (end[r] - along) * side
+        m = wp.where(m < n, m, n)
+        lanes[r] = wp.where(m >= 0.0, r, NEVER)
+        r += 1
+    return lanes
+
+
+@wp.func
+def turn(su: float, sv: float, eu: float, ev: float):
+    """How an edge of a projected triangle counts in `inside.turns_around`: 1, -1 or 0."""
+    rising = sv <= 0.0
+    changes = rising != (ev <= 0.0)
+    lu = wp.where(rising, su, eu)
+    lv = wp.where(rising, sv, ev)
+    hu = wp.where(rising, eu, su)
+    hv = wp.where(rising, ev, sv)
+    counts = wp.where(lu * hv > hu * lv, wp.where(rising, 1, -1), 0)
+    return wp.where(changes, counts, 0)
+
+
+@wp.func
+def turns_of_leaf(corners: wp.array2d[vec8], leaf: int, axis: int, pu: float, pv: float):
+    """`inside.turns_around` of the triangles of a leaf, along a ray."""
+    u = (axis + 1) % 3
+    v = (axis + 2) % 3
+    au = corners[leaf, u]
+    av = corners[leaf, v]
+    bu = corners[leaf, u + 3]
+    bv = corners[leaf, v + 3]
+    cu = corners[leaf, u + 6]
+    cv = corners[leaf, v + 6]
+    turns = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        a0 = au[r] - pu
+        a1 = av[r] - pv
+        b0 = bu[r] - pu
+        b1 = bv[r] - pv
+        c0 = cu[r] - pu
+        c1 = cv[r] - pv
+        turns[r] = turn(a0, a1, b0, b1) + turn(b0, b1, c0, c1) + turn(c0, c1, a0, a1)
+        r += 1
+    return turns
+
+
+@wp.func
+def crossings_in_leaf(corners: wp.array2d[vec8], leaf: int, point: wp.vec3, axis: int, side: float):
+    """`inside.crossings` of the triangles of a leaf."""
+    turns = turns_of_leaf(corners, leaf, axis, point[(axis + 1) % 3], point[(axis + 2) % 3])
+    lanes = vec8i()
+    r = wp.int32(0)
+    while r < 8:
+        lanes[r] = wp.where(turns[r] != 0, r, NEVER)
+        r += 1
+    total = wp.int32(0)
+    r = least(lanes)
+    while r < 8:
+        a = wp.vec3(corners[leaf, 0][r], corners[leaf, 1][r], corners[leaf, 2][r]) - point
+        b = wp.vec3(corners[leaf, 3][r], corners[leaf, 4][r], corners[leaf, 5][r]) - point
+        c = wp.vec3(corners[leaf, 6][r], corners[leaf, 7][r], corners[leaf, 8][r]) - point
+        total += crossing(turns[r], volume_of(wp.vec3d(a), wp.vec3d(b), wp.vec3d(c)), side)
+        r = least_above(lanes, r)
+    return total
+
+
+@wp.func
+def crossings_by_tree(tree: Tree, b: int, point: wp.vec3, axis: int, side: float) -> int:
+    """Signed number of crossings of a ray with a body, as `inside.crossings`."""
+    pu = point[(axis + 1) % 3]
+    pv = point[(axis + 2) % 3]
+    along = point[axis]
+    total = wp.int32(0)
+    nodes = stack64()
+    nodes[0] = tree.nodes[b]
+    top = wp.int32(1)
+    while top > 0:
+        top -= 1
+        node = nodes[top]
+        lanes = boxes_on_ray(tree.boxes, node, along, pu, pv, axis, side)
+        first = tree.children[node]
+        lane = least(lanes)
+        while lane < 8:
+            if first < 0:
+                total += crossings_in_leaf(tree.corners, ~first + lane, point, axis, side)
+            else:
+                nodes[top] = first + lane
+                top += 1
+            lane = least_above(lanes, lane)
+    return total
