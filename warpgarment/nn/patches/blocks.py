@@ -7,6 +7,8 @@ gets the same bits with any number of threads and in any batch. Operators are th
     faces, by blocks      embedding; face layer
     garments              pooling, encoder layers, change of the patches
     faces, by blocks      the change spread to faces, norm; for each further face layer: the layer, the next norm; head
+
+Where the processor has tiles (AMX), tiled.py does the same by kernels.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ import torch.nn.functional as F
 
 from warpgarment.kernels.threads import spread, torch_on_one
 from warpgarment.nn.attention import one_by_one
+
+from . import tiled
 
 if TYPE_CHECKING:
     from .layout import PatchLayout
@@ -81,6 +85,8 @@ def forward(
     """
     rows, count, width = faces.shape
     patches = layout.start.shape[1]
+    if tiled.fits(network, patches + tokens.shape[1]):
+        return tiled.forward(network, faces, tokens, layout, mask)
     own = list(torch.empty((2, *faces.shape)))
     heard = faces.new_empty((rows, patches, width))
     answer = faces.new_empty((rows, count, network.face_head.out_features))

@@ -26,7 +26,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import NormalisedOutput
 from warpgarment.nn.network import GarmentNetwork
 
-from . import blocks
+from . import blocks, tiled
 from .layout import PatchLayout
 
 if TYPE_CHECKING:
@@ -140,6 +140,8 @@ class PatchTransformer(GarmentNetwork):
         W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
         """
         face_features = self.read(self._without_padding(face_features, face_mask))
+        if blocks.by_blocks(face_features) and tiled.fits(self):
+            return tiled.embedded(self, face_features, turn)
         weight = self.embed_faces.weight
         if self.outdoor.width:
             weight = weight[:, : -self.outdoor.width]

@@ -1,0 +1,115 @@
+"""Weights of a first layer, turned to the heading of a garment and packed for the tiles of tiles.py, in one launch.
+
+    W [G (f - G^T m)] = (W G) (f - m G)        G [K,K] turns the K features of a frame, m is their mean
+
+The same G turns all frames of the history, so the columns of W are turned in groups of K.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.operator import allocate
+
+from .tiles import argument, padded, source
+
+VECTOR = 16
+
+
+@wp.func_native(
+    source("""
+    const int outputs16 = outputs / 16, row = t / outputs16, tile = t % outputs16;
+    const int features = frames * channels, depth = (features + 31) / 32, wide = (channels + 15) / 16 * 16;
+    const float* turn = turns.data + (long)row * channels * wide;
+    alignas(64) float line[1024 + 32];
+    alignas(64) __bf16 both[2][32];
+    __bf16* to = (__bf16*)result.data + ((long)row * outputs16 + tile) * depth * 1024;
+    for (int n = -1; n < 16; n++) {
+        if (n < 0 && tile) continue;
+        const float* from = n < 0 ? mean.data : weight.data + (long)(16 * tile + n) * features;
+        for (int h = 0; h < frames; h++)
+            for (int j = 0; j < wide; j += 16) {
+                v16 sum = {};
+                const float* at = from + (n < 0 ? 0 : h * channels);
+                for (int i = 0; i < channels; i++)
+                    sum = Tiles::fma(Tiles::all(at[i]), Tiles::load(turn + i * wide + j), sum);
+                Tiles::store(line + h * channels + j, sum);
+            }
+        for (int k = features; k < 32 * depth; k++) line[k] = 0.0f;
+        if (n < 0) {
+            __builtin_memcpy(centre.data + (long)row * 32 * depth, line, 128l * depth);
+            continue;
+        }
+        for (int k = 0; k < depth; k++) {
+            for (int half = 0; half < 32; half += 16)
+                Tiles::split(Tiles::load(line + 32 * k + half), both[0] + half, both[1] + half);
+            for (int part = 0; part < 2; part++)
+                for (int pair = 0; pair < 16; pair++)
+                    ((int*)to)[((2 * k + part) * 16 + pair) * 16 + n] = ((int*)both[part])[pair];
+        }
+    }
+""")
+)
+def turned_tile(
+    t: int,
+    outputs: int,
+    frames: int,
+    channels: int,
+    weight: wp.array[wp.float32],
+    mean: wp.array[wp.float32],
+    turns: wp.array[wp.float32],
+    centre: wp.array[wp.float32],
+    result: wp.array[wp.int16],
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def turned_kernel(
+    outputs: wp.int32,
+    frames: wp.int32,
+    channels: wp.int32,
+    # Model:
+    weight: wp.array[wp.float32],
+    mean: wp.array[wp.float32],
+    # In:
+    turns: wp.array[wp.float32],
+    # Out:
+    centre: wp.array[wp.float32],
+    result: wp.array[wp.int16],
+):
+    turned_tile(wp.tid(), outputs, frames, channels, weight, mean, turns, centre, result)
+
+
+MOST_INPUTS = 1024  # for which a thread has room
+
+
+def turned(weight: torch.Tensor, mean: torch.Tensor, turns: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Turned and packed weights of a first layer.
+
+    Args:
+        weight: Weights over the deviations of the features, shape [O,H,K]; O is a multiple of 32, H K at most
+            `MOST_INPUTS`.
+        mean: Mean of the features, shape [K].
+        turns: Rotation of the features of a frame for each garment, shape [R,K,K'], columns padded with zeros to a
+            multiple of `VECTOR`.
+
+    Returns:
+        What is to be subtracted from features in world space, shape [R,I'] with I' from `padded`; weights as from
+        `tiles.pack`, as int16, shape [R, O I' 2].
+    """
+    outputs, frames, channels = weight.shape
+    rows, inputs = len(turns), padded(frames * channels)
+    centre = allocate((rows, inputs), torch.float32, weight.device)
+    result = allocate((rows, 2 * outputs * inputs), torch.int16, weight.device)
+    given = [argument(values) for values in (weight, mean, turns)]
+    with torch_stream(weight.device) as device:
+        wp.launch(
+            turned_kernel,
+            dim=rows * outputs // VECTOR,
+            inputs=[outputs, frames, channels, *given],
+            outputs=[argument(centre), argument(result)],
+            device=device,
+        )
+    return centre, result

@@ -1,0 +1,133 @@
+"""Layers of faces on tiles against the same layers in float64, with numbers of faces that are no whole blocks."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from support.comparing import close
+from support.poison import poison_outputs
+
+from warpgarment.kernels.dense import faces, tiles
+from warpgarment.kernels.dense.turned import turned
+
+pytestmark = pytest.mark.skipif(not tiles.available(), reason="this processor has no tiles for bfloat16 (AMX)")
+
+ROWS, COUNT, WIDTH, HIDDEN = 2, 75, 96, 64  # 75 faces: two blocks of 32 and one of 11
+OFF = 1e-4
+"""Products of numbers around one lose 2^-17 of each term: 1e-5 in a sum of a hundred. bfloat16 alone: 1e-2."""
+
+
+def normal(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed + sum(shape)))
+
+
+def packed(weight: torch.Tensor) -> torch.Tensor:
+    return tiles.pack(weight).view(torch.int16).flatten()
+
+
+def perceptron(inputs: int = WIDTH):
+    """A layer, and the function that it is, in float64."""
+    expand, contract = normal(HIDDEN, inputs) / inputs**0.5, normal(WIDTH, HIDDEN) / HIDDEN**0.5
+    b, c = normal(HIDDEN), normal(WIDTH)
+    layer = faces.Perceptron(packed(expand), b, packed(contract), c)
+    return layer, lambda x: F.linear(F.gelu(F.linear(x, expand.double(), b.double())), contract.double(), c.double())
+
+
+def norm(x: torch.Tensor) -> torch.Tensor:
+    return F.layer_norm(x.double(), (WIDTH,))
+
+
+def test_packed_numbers_are_the_weights_in_tiles():
+    """A product would multiply by other weights: tiles hold pairs of inputs of sixteen outputs, hi and lo apart.
+
+    The sum of both is the weight to 2^-17 of it.
+    """
+    weight = normal(40, 70)
+    both = tiles.pack(weight).double()
+    assert both.shape == (4, 3, 2, 16, 16, 2)
+    whole = both.sum(dim=2)
+    for o, i in ((0, 0), (17, 5), (39, 69), (39, 68)):
+        found = whole[o // 16, i // 32, i % 32 // 2, o % 16, i % 2]
+        assert abs(found - weight[o, i]) <= 2.0**-17 * abs(weight[o, i])
+    assert whole[2, :, :, 8:].abs().max() == 0.0
+    assert whole[:, 2, 3:].abs().max() == 0.0
+
+
+def test_turned_weights(monkeypatch):
+    """Features would be turned by another heading, the inverse one, or frames of the history mixed up."""
+    allocated = poison_outputs(monkeypatch)
+    frames, channels = 3, 34
+    weight, mean, turns = normal(WIDTH, frames, channels), normal(channels), normal(ROWS, channels, channels)
+    x, bias = normal(ROWS, COUNT, frames * channels), normal(WIDTH)
+    result = faces.embed(x, *turned(weight, mean, F.pad(turns, (0, 14))), bias)
+    assert len(allocated) == 3
+    seen = x.double().unflatten(2, (frames, channels)) - torch.einsum("i,rij->rj", mean, turns)[:, None, None].double()
+    expected = torch.einsum("ehi,rij,rnhj->rne", weight.double(), turns.double(), seen) + bias.double()
+    close(result, expected, 3e-5 * expected.abs().max().item())
+
+
+def test_the_layer_before_patches():
+    """A part of the layer would be missing: the norm, a bias, the activation, the sum; or the last block be cut."""
+    x = 3.0 * normal(ROWS, COUNT, WIDTH) + 1.0
+    layer, function = perceptron()
+    expected = x.double() + function(norm(x))
+    faces.first(x, layer)
+    close(x, expected, OFF)
+
+
+@pytest.mark.parametrize("layouts", [1, ROWS])
+def test_what_patches_have_heard(layouts, monkeypatch):
+    """Faces would get another patch's or another garment's change, or the norm be that of before."""
+    poison_outputs(monkeypatch)
+    x, heard, share = normal(ROWS, COUNT, WIDTH), normal(ROWS, 7, WIDTH), normal(layouts, COUNT, 4)
+    patch = torch.randint(7, (layouts, COUNT, 4), generator=torch.Generator().manual_seed(1))
+    given = [share[r % layouts, :, :, None].double() * heard[r][patch[r % layouts]].double() for r in range(ROWS)]
+    expected = x.double() + torch.stack(given).sum(dim=2)
+    own = faces.spread(x, patch, share, heard)
+    close(x, expected, 1e-5)  # sums in float32
+    close(own, norm(expected), 1e-5)
+
+
+@pytest.mark.parametrize("layouts", [1, ROWS, None])
+def test_the_layers_after_patches(layouts, monkeypatch):
+    """Faces would hear others than their neighbours, or themselves where they have none, as in a subset."""
+    poison_outputs(monkeypatch)
+    x, own, following = (
+        normal(ROWS, COUNT, WIDTH),
+        normal(ROWS, COUNT, WIDTH, seed=5),
+        torch.full((2, 75, 96), torch.nan),
+    )
+    sides, heard = None, own
+    if layouts is not None:
+        sides = torch.randint(COUNT, (layouts, COUNT, 3), generator=torch.Generator().manual_seed(1))
+        around = torch.stack([own[r][sides[r % layouts]].mean(dim=1) for r in range(ROWS)])
+        heard = torch.cat([own, around], dim=2)
+    layer, function = perceptron(heard.shape[2])
+    expected = x.double() + function(heard.double())
+    faces.hear(x, own, sides, layer, following)
+    close(x, expected, OFF)
+    close(following, norm(expected), OFF)
+    weight, bias = normal(12, WIDTH) / WIDTH**0.5, normal(12)
+    close(faces.head(own, packed(weight), bias), F.linear(own.double(), weight.double(), bias.double()), OFF)
+
+
+def test_faces_do_not_depend_on_others_of_the_batch():
+    """A garment would move otherwise in a batch or with more threads: a face's block would leak into it. Exact."""
+    layer, _ = perceptron()
+    x = normal(ROWS, COUNT, WIDTH)
+    together, alone = x.clone(), x[1:, 40:].clone()
+    faces.first(together, layer)
+    faces.first(alone, layer)
+    assert torch.equal(together[1:, 40:], alone)
+
+
+def test_the_activation():
+    """GELU would be another function where its polynomials meet, or beyond the last. Measured: 3e-8 and rounding."""
+    x = torch.cat([torch.linspace(-8.0, 8.0, 31 * 64), torch.tensor([0.0, -0.0, 1e4, -1e4] * 16)]).reshape(1, -1, 32)
+    one, zero = torch.eye(64)[:32], torch.zeros(32)
+    layer = faces.Perceptron(packed(torch.zeros(64, 32)), torch.zeros(64), packed(one.clone().zero_()), zero)
+    for value in x.flatten().tolist():
+        bias = torch.full((64,), value)
+        row = torch.zeros(1, 1, 32)
+        faces.first(row, layer._replace(expand_bias=bias, contract=packed(one)))
+        expected = F.gelu(torch.tensor(value, dtype=torch.float64)).item()
+        assert abs(row[0, 0, 0].item() - expected) <= 1e-7 + 2.0**-17 * abs(expected), value

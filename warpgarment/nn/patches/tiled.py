@@ -1,0 +1,228 @@
+"""The network of patches on a processor with tiles (AMX): the layers of faces as kernels of `kernels/dense`.
+
+Weights are packed once per network. The scale and shift of a layer norm are part of the layer after it:
+
+    W (g n(x) + s) + b = (W g) n(x) + (b + W s)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import nn
+
+from warpgarment.kernels.dense import faces as dense
+from warpgarment.kernels.dense import tiles, tokens
+from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
+from warpgarment.kernels.features.channels import Kind, Layout
+
+if TYPE_CHECKING:
+    from warpgarment.nn.attention import EncoderLayer
+
+    from .layout import PatchLayout
+    from .network import FaceLayer, PatchTransformer
+
+
+Place = Mapping[str, torch.Tensor | None]
+
+
+class Source(NamedTuple):
+    """A parameter or a buffer of a module, as it was."""
+
+    place: Place  # where its module keeps it
+    name: str
+    value: torch.Tensor
+    address: int
+    version: int
+
+    def fresh(self) -> bool:
+        """Whether the module still has it, with the same values."""
+        value = self.value
+        same = self.place[self.name] is value and value.data_ptr() == self.address
+        return same and value._version == self.version
+
+
+class Packed(NamedTuple):
+    """The weights of the layers of faces as the kernels read them."""
+
+    sources: list[Source]  # the parameters and statistics they were made from
+    embed: torch.Tensor  # [F,H,K], over the deviations of the features
+    first_factor: torch.Tensor  # of each entry of the matrix that turns features, from `factors`
+    second_factor: torch.Tensor
+    known: torch.Tensor  # [2], one and zero
+    first: dense.Perceptron
+    after: list[dense.Perceptron]  # for faces that hear their neighbours
+    alone: list[dense.Perceptron]  # for subsets of faces
+    head: torch.Tensor
+    head_bias: torch.Tensor
+    encoder: tokens.Encoder
+
+    def fresh(self) -> bool:
+        """Whether no weight has changed since."""
+        return all(source.fresh() for source in self.sources)
+
+
+_known: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()
+
+
+def fits(network: PatchTransformer, count: int = 0) -> bool:
+    """Whether the kernels can do this network's layers, on rows of that many tokens and on this processor."""
+    config = network.config
+    widths = (config.face_embedding, config.face_feed_forward, config.embedding, config.feed_forward)
+    head = config.embedding // config.heads
+    columns = 3 * config.embedding - 2 * config.manifold_heads * head
+    fit = all(width % tiles.STEP == 0 and width <= tiles.WIDEST for width in widths)
+    fit = fit and head % tiles.STEP == 0 and columns <= tokens.MOST_COLUMNS and config.inputs <= MOST_INPUTS
+    fit = fit and count <= tokens.MOST_TOKENS
+    return fit and config.norm_first and config.activation == "gelu" and tiles.available()
+
+
+def packed(network: PatchTransformer) -> Packed:
+    """The packed weights of a network, made anew when a weight has changed."""
+    known = _known.get(network)
+    if known is None or not known.fresh():
+        known = _pack(network)
+        if not any(source.value.is_inference() for source in known.sources):  # these do not count their changes
+            _known[network] = known
+    return known
+
+
+def _sources(network: PatchTransformer) -> list[Source]:
+    """All parameters of a network and the statistics that are part of its weights."""
+    places: list[tuple[Place, str]] = [(m._parameters, name) for m in network.modules() for name in m._parameters]
+    found = []
+    for place, name in [*places, (network._buffers, "feature_std")]:
+        value = place[name]
+        if value is not None:
+            found.append(Source(place, name, value, value.data_ptr(), 0 if value.is_inference() else value._version))
+    return found
+
+
+def _pack(network: PatchTransformer) -> Packed:
+    weight = network.embed_faces.weight
+    weight = weight[:, : weight.shape[1] - network.outdoor.width].unflatten(1, (-1, network.channels.width))
+    layers = [cast("FaceLayer", layer) for layer in network.after]
+    head, head_bias = folded(network.face_norm, network.face_head.weight, network.face_head.bias)
+    return Packed(
+        _sources(network),
+        (weight / network.feature_std).contiguous(),
+        *factors(network.channels),
+        torch.tensor([1.0, 0.0]),
+        _perceptron(network.before, hears=False),
+        [_perceptron(layer, hears=True) for layer in layers],
+        [_perceptron(layer, hears=False) for layer in layers],
+        as_tiles(head),
+        head_bias,
+        _encoder(network),
+    )
+
+
+def factors(layout: Layout) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the two factors of each entry of `layout.turn(G)` are, which is padded to columns of sixteen.
+
+    Returns:
+        Indices into the nine entries of G, one and zero: two arrays of int64 [K * K'].
+    """
+    one, zero = 9, 10
+    place = np.full((2, layout.width, -(-layout.width // VECTOR) * VECTOR), zero)
+    for channel in layout.channels:
+        begin = layout.slices[channel.name].start
+        if channel.kind is Kind.SCALAR:
+            for i in range(channel.width):
+                place[:, begin + i, begin + i] = one
+        for i, j, k, n in np.ndindex(3, 3, 3, 3):
+            row, column = begin + 3 * i + k, begin + 3 * j + n
+            if channel.kind is Kind.MAP:
+                place[:, row, column] = 3 * i + j, 3 * k + n
+            elif channel.kind is Kind.FROM_REST and k == n:
+                place[:, row, column] = 3 * i + j, one
+            elif channel.kind in (Kind.VECTOR, Kind.POINT):
+                place[:, begin + i, begin + j] = 3 * i + j, one
+    first, second = torch.from_numpy(place).flatten(1)
+    return first, second
+
+
+def _encoder(network: PatchTransformer) -> tokens.Encoder:
+    config = network.config
+    head = config.embedding // config.heads
+    unused = 2 * config.manifold_heads * head
+    learned = config.embedding - config.manifold_heads * head
+    root = torch.ones(2 * learned + config.embedding)
+    root[:learned] = head**-0.5
+    weights, biases = [], []
+    for layer in cast("list[EncoderLayer]", network.layers):
+        qkv, out = layer.attention.qkv, layer.attention.out
+        weight, bias = folded(layer.attention_norm, qkv.weight[unused:], qkv.bias[unused:])
+        expand, expand_bias = folded(layer.feed_forward_norm, layer.expand.weight, layer.expand.bias)
+        weights += [weight * root[:, None], out.weight, expand, layer.contract.weight]
+        biases += [bias * root, out.bias, expand_bias, layer.contract.bias]
+    velocity, velocity_bias = folded(network.final_norm, network.velocity_head.weight, network.velocity_head.bias)
+    weights.append(network.from_patches.weight)
+    biases += [network.from_patches.bias, velocity_bias, velocity, network.to_velocity.weight]
+    return tokens.Encoder(
+        config.embedding,
+        learned,
+        head,
+        config.feed_forward,
+        config.layers,
+        as_tiles(network.to_patches.weight),
+        network.to_patches.bias.detach(),
+        torch.cat([as_tiles(weight) for weight in weights]),
+        torch.cat([values.flatten() for values in biases]),
+    )
+
+
+def as_tiles(weight: torch.Tensor) -> torch.Tensor:
+    """Packed weights in one dimension, as int16."""
+    return tiles.pack(weight).view(torch.int16).flatten()
+
+
+def folded(norm: nn.Module, weight: torch.Tensor, bias: torch.Tensor | Any) -> tuple[torch.Tensor, torch.Tensor]:
+    """Weights and biases of a layer with the scale and shift of the norm before it."""
+    norm = cast("nn.LayerNorm", norm)
+    return weight * norm.weight, bias + weight @ norm.bias
+
+
+def _perceptron(layer: FaceLayer, *, hears: bool) -> dense.Perceptron:
+    weight, bias = folded(layer.norm, layer.expand.weight, layer.expand.bias)
+    if hears:
+        around, bias = folded(layer.norm, layer.hear.weight, bias)
+        weight = torch.cat([weight, around], dim=1)
+    return dense.Perceptron(as_tiles(weight), bias, as_tiles(layer.contract.weight), layer.contract.bias.detach())
+
+
+def embedded(network: PatchTransformer, features: torch.Tensor, turn: torch.Tensor | None) -> torch.Tensor:
+    """`PatchTransformer.embedded` of features [R,N,H*K] that hold the channels the network reads."""
+    weights = packed(network)
+    turn = torch.eye(3)[None] if turn is None else turn
+    entries = torch.cat([turn.flatten(1), weights.known.expand(len(turn), -1)], dim=1)
+    turns = (entries[:, weights.first_factor] * entries[:, weights.second_factor]).unflatten(
+        1, (network.channels.width, -1)
+    )
+    centre, weight = turned(weights.embed, network.feature_mean, turns)
+    return dense.embed(features, centre, weight, network.embed_faces.bias.detach())
+
+
+def forward(
+    network: PatchTransformer,
+    faces: torch.Tensor,
+    given: torch.Tensor,
+    layout: PatchLayout,
+    mask: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The network from embedded faces to the outputs of its heads; arguments and result as of `blocks.forward`."""
+    weights = packed(network)
+    dense.first(faces, weights.first)
+    pools = tokens.Pools(layout.start, layout.member, layout.member_weight, layout.pieces, layout.weights)
+    real = None if mask is None else mask.flatten(1)
+    heard, velocity = tokens.encode(weights.encoder, faces, given, pools, real)
+    own = dense.spread(faces, layout.patch, layout.share, heard)
+    room = torch.empty_like(own)
+    for layer in weights.alone if layout.neighbours is None else weights.after:
+        dense.hear(faces, own, layout.neighbours, layer, room)
+        own, room = room, own
+    return dense.head(own, weights.head, weights.head_bias), velocity
