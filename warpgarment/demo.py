@@ -23,7 +23,7 @@ from warpgarment.objects.material import Material
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.objects.outfit import Outfit
 from warpgarment.objects.wind import Wind
-from warpgarment.view.progress import counted
+from warpgarment.progress import counted
 from warpgarment.view.report import rollout_table
 
 from . import metrics

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from alembic3d import Abc, AbcGeom
 from pxr import Usd, UsdGeom
 from support.outfits import layersnet
 from support.scenes import network, tube, walk
@@ -87,6 +88,23 @@ def test_all_garments_go_into_one_stage(scene, tmp_path, capsys):
         np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get(3)), motion.vertices[3], atol=1e-6)
 
 
+def test_all_garments_go_into_one_archive(scene, tmp_path):
+    """An Alembic archive would hold one garment, inside out, or be read by its numbers of samples as seconds. Every
+    frame at its time, by Alembic's own library; faces are clockwise."""
+    assert simulate(scene, "--out", tmp_path / "o.abc") == 0
+    expected = Simulator(checkpoint.load(scene / "plain.safetensors"), "cpu").rollout(garments(scene), walk(4))
+    top = Abc.IArchive(str(tmp_path / "o.abc")).getTop()
+    assert [top.getChildHeader(k).getName() for k in range(top.getNumChildren())] == ["under", "over"]
+    for name, motion in zip(("under", "over"), expected, strict=True):
+        schema = AbcGeom.IPolyMesh(top, name).getSchema()
+        assert schema.getNumSamples() == 4
+        for k in range(4):
+            value = schema.getValue(Abc.ISampleSelector(k / 30))  # whole numbers would be seconds too
+            np.testing.assert_allclose(np.array(value.getPositions()), motion.vertices[k], atol=1e-6)
+        corners = np.array(value.getFaceIndices()).reshape(-1, 3)
+        np.testing.assert_array_equal(corners[:, [0, 2, 1]], motion.faces)
+
+
 def test_crossing_starts_have_a_status_of_their_own(scene, tmp_path, capsys):
     """A script would take crossing layers for free ones. The numbers of pairs are those of the rollout."""
     moved = garments(scene)[1]
@@ -136,7 +154,7 @@ def test_what_a_network_does_not_read_is_refused(scene, tmp_path, capsys):
     [
         (
             ["--out", "o.npz"],
-            "2 garments do not go into one .npz. Write them into one .usd, or each into a file of its",
+            "2 garments do not go into one .npz. Write them into one .usd or .abc, or each into a file of its",
         ),
         (["--out", "o/"], "{name}/ has their names"),
         (["--out", "{name}.xyz"], "cannot write 'under.xyz'"),

@@ -17,6 +17,7 @@ from support.meshes import capsule
 
 import warpgarment as wg
 from warpgarment.cli import main
+from warpgarment.io.together import write_together
 
 BODY = capsule((0, 0.2, 0), (0, 1.5, 0), 0.2)
 FRAMES = BODY.vertices + np.arange(25, dtype=np.float32)[:, None, None] * np.float32([0, 0, 0.01])
@@ -59,7 +60,7 @@ def test_alembic_reads_what_is_written(tmp_path):
     garment = wg.Garment.load(write_obj(tmp_path / "skirt.obj"))
     frames = garment.vertices + np.arange(5, dtype=np.float32)[:, None, None] * np.float32([0, 0.01, 0])
     motion = wg.GarmentMotion(frames, garment.faces, 24, start=1001 / 24, name="my/skirt", surface=garment.surface)
-    with pytest.warns(UserWarning, match="left out: materials, groups"):
+    with pytest.warns(UserWarning, match="left out: groups, colours and pictures of materials"):
         motion.save(tmp_path / "m.abc")
     schema = opened(tmp_path / "m.abc")
     assert schema.getNumSamples() == 5
@@ -77,7 +78,66 @@ def test_alembic_reads_what_is_written(tmp_path):
         assert found.tolist() == back
         order = [polygon.coordinates[0], *polygon.coordinates[:0:-1]]
         np.testing.assert_array_equal(uv, UV[order])
-    assert wg.GarmentMotion.load(tmp_path / "m.abc").surface.coordinates[0].values.shape == UV.shape
+    back = wg.GarmentMotion.load(tmp_path / "m.abc").surface
+    assert back.coordinates[0].values.shape == UV.shape
+    assert [back.materials[k].name for k in back.material] == [polygon.material for polygon in POLYGONS]
+
+
+def test_several_meshes_have_their_names_and_materials(tmp_path):
+    """Garments would lie in one mesh, two of one name be lost, or a program assign no material: by Alembic's own
+    library, meshes by name, every frame, and sets of faces by the names of materials."""
+    garment = wg.Garment.load(write_obj(tmp_path / "skirt.obj"))
+    skirts = garment.vertices + np.arange(25, dtype=np.float32)[:, None, None] * np.float32([0, 0.01, 0])
+    meshes = [("skirt", skirts, garment.faces), ("a/b", FRAMES, BODY.faces), ("skirt", FRAMES + 1, BODY.faces)]
+    with pytest.warns(UserWarning, match="left out: groups, colours and pictures of materials"):
+        write_together(tmp_path / "m.abc", meshes, 24, [garment.surface, None, None], start=1001)
+    top = Abc.IArchive(str(tmp_path / "m.abc")).getTop()
+    names = [top.getChildHeader(k).getName() for k in range(top.getNumChildren())]
+    assert names == ["skirt", "a_b", "skirt_2"]
+    for name, (_, frames, _) in zip(names, meshes, strict=True):
+        schema = AbcGeom.IPolyMesh(top, name).getSchema()
+        assert schema.getNumSamples() == 25
+        for k in (0, 7, 24):
+            value = schema.getValue(Abc.ISampleSelector((1001 + k) / 24))  # a number is a time [s]
+            np.testing.assert_array_equal(np.array(value.getPositions()), frames[k])
+    schema = AbcGeom.IPolyMesh(top, "skirt").getSchema()
+    assert sorted(schema.getFaceSetNames()) == sorted({polygon.material for polygon in POLYGONS})
+    for name in schema.getFaceSetNames():
+        faces = schema.getFaceSet(name).getSchema().getValue(0).getFaces()
+        assert list(faces) == [k for k, polygon in enumerate(POLYGONS) if polygon.material == name]
+    assert len(AbcGeom.IPolyMesh(top, "a_b").getSchema().getFaceSetNames()) == 0
+    corners = np.array(AbcGeom.IPolyMesh(top, "skirt_2").getSchema().getValue(0).getFaceIndices()).reshape(-1, 3)
+    np.testing.assert_array_equal(corners[:, [0, 2, 1]], BODY.faces)
+    back = wg.GarmentMotion.load(tmp_path / "m.abc", mesh="skirt").surface
+    assert [back.materials[k].name for k in back.material] == [polygon.material for polygon in POLYGONS]
+    with pytest.raises(wg.MeshError, match="5 and 25 frames"):
+        write_together(tmp_path / "n.abc", [meshes[0], ("b", FRAMES[:5], BODY.faces)], 24, [None, None])
+    assert not (tmp_path / "n.abc").exists()
+
+
+def test_sets_of_faces_that_overlap_are_no_materials(tmp_path):
+    """A selection that somebody kept in a file would become a material. None is read where sets overlap; one that
+    names faces that are not there leaves the mesh as it is."""
+    for overlapping in (True, False):
+        path = tmp_path / f"{overlapping}.abc"
+        archive = Abc.OArchive(str(path))
+        schema = AbcGeom.OPolyMesh(archive.getTop(), "m").getSchema()
+        faces = imath.IntArrayFromBuffer(np.ascontiguousarray(BODY.faces.reshape(-1), dtype=np.int32))
+        counts = imath.IntArrayFromBuffer(np.full(len(BODY.faces), 3, np.int32))
+        schema.set(AbcGeom.OPolyMeshSchemaSample(imath.V3fArrayFromBuffer(FRAMES[0]), faces, counts))
+        for name, rows in (("a", [0, 1, 2]), ("b", [2, 3] if overlapping else [10**6])):
+            sample = AbcGeom.OFaceSetSchemaSample()
+            sample.setFaces(imath.IntArrayFromBuffer(np.array(rows, np.int32)))
+            schema.createFaceSet(name).getSchema().set(sample)
+        del schema, archive
+        gc.collect()
+        if overlapping:
+            garment = wg.Garment.load(path)
+        else:
+            with pytest.warns(UserWarning, match="names polygons beyond"):
+                garment = wg.Garment.load(path)
+        assert garment.surface is None or not garment.surface.materials
+        assert len(garment.faces) == len(BODY.faces)
 
 
 @pytest.mark.parametrize("fps", [24000 / 1001, 24, 25, 30, 60, 23.976])

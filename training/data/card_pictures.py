@@ -12,8 +12,8 @@ import numpy as np
 
 from warpgarment.errors import MissingExtra
 from warpgarment.io.disk.atomic import atomic_file
+from warpgarment.progress import counted
 from warpgarment.view import draw
-from warpgarment.view.progress import counted
 
 from .sequence import Sequence as SequenceOnDisk
 

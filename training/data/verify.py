@@ -19,7 +19,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.plain import open_plain
-from warpgarment.view.progress import counted
+from warpgarment.progress import counted
 from warpgarment.view.report import table
 
 from .layout import SPLITS

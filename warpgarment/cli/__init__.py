@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from warpgarment.errors import MeshError
+from warpgarment.progress import bars
 
 _ROOM = "warpgarment"
 NOT_FREE = 3  # exit status where a result was written that is not free of crossings
@@ -119,7 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verb = VERBS[name]
     try:
         options = _options(verb, name, arguments[1:])
-        status = getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.function)(options)
+        with bars():
+            status = getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.function)(options)
     except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
         return _complain(f"{type(error).__name__}: {error}")
     except ModuleNotFoundError as error:

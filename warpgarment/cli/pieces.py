@@ -1,4 +1,4 @@
-"""The garments of `simulate`: which files and meshes they are, and where each is written."""
+"""The garments of `simulate` and `dress`: which files and meshes they are, and where each is written."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import NamedTuple
 from warpgarment.errors import UsageError
 from warpgarment.io.disk.outputs import names_folder
 from warpgarment.io.files import suffixes
+from warpgarment.io.together import TOGETHER, write_together
 from warpgarment.objects.motion import GarmentMotion
 
 from .outputs import Folder, check_output
 
 PATTERN = "{name}"
-TOGETHER = (".usd", ".usda", ".usdc")  # formats of which one file holds several garments
 
 
 class Piece(NamedTuple):
@@ -26,14 +26,19 @@ class Piece(NamedTuple):
     name: str
 
 
-def pieces_of(files: Sequence[Path], meshes: Sequence[str]) -> list[Piece]:
+def pieces_of(files: Sequence[Path], meshes: Sequence[str], *, verb: str = "simulate") -> list[Piece]:
     """The garments of files and names of meshes: as many of each, or one file with several meshes.
+
+    Args:
+        files: Files of the garments.
+        meshes: Names of meshes in them.
+        verb: What was given them, for the message.
 
     Raises:
         UsageError: There is no file, or the numbers do not fit.
     """
     if not files:
-        raise UsageError("simulate was given one file. Name garments, innermost first, and then the body.")
+        raise UsageError(f"{verb} was given one file. Name garments, innermost first, and then the body.")
     if len(meshes) > 1 and len(files) == 1:
         files = list(files) * len(meshes)
     if meshes and len(meshes) != len(files):
@@ -54,13 +59,16 @@ def pieces_of(files: Sequence[Path], meshes: Sequence[str]) -> list[Piece]:
     return found
 
 
-def outputs_of(out: Path, pieces: Sequence[Piece], inputs: Sequence[Path | None]) -> dict[str, Path]:
-    """Where each garment is written, by its name; all in one USD stage, or each in a file of its own.
+def outputs_of(
+    out: Path, pieces: Sequence[Piece], inputs: Sequence[Path | None], *, writer: str = "write_motion"
+) -> dict[str, Path]:
+    """Where each garment is written, by its name; all in one file, or each in a file of its own.
 
     Args:
-        out: As it was typed: a .usd for all garments, or with {name} for the name of each.
+        out: As it was typed: a .usd or .abc for all garments, or with {name} for the name of each.
         pieces: The garments.
         inputs: Files that are read.
+        writer: What writes them, see `io.files.suffixes`.
 
     Raises:
         UsageError: Several garments, and one file that cannot hold them.
@@ -76,23 +84,21 @@ def outputs_of(out: Path, pieces: Sequence[Piece], inputs: Sequence[Path | None]
     else:
         raise UsageError(
             f"--out {typed}: {len(pieces)} garments do not go into one {out.suffix or 'folder of OBJ'}. Write them "
-            f"into one .usd, or each into a file of its own: {PATTERN}{out.suffix or '/'} has their names."
+            f"into one .usd or .abc, or each into a file of its own: {PATTERN}{out.suffix or '/'} has their names."
         )
     for path in dict.fromkeys(found.values()):
-        check_output(path, suffixes("write_motion"), inputs)
+        check_output(path, suffixes(writer), inputs)
     return found
 
 
 def save(motions: Mapping[str, GarmentMotion], outputs: Mapping[str, Path]) -> None:
-    """Writes each garment to its file, or all of them to the one USD stage that all are for."""
+    """Writes each garment to its file, or all of them to the one that all are for."""
     if len(motions) == 1 or len(set(outputs.values())) > 1:
         for name, motion in motions.items():
             motion.save(outputs[name])
         return
-    from warpgarment.io.usd import write_usd
-
     frames = min(motion.frames for motion in motions.values())  # one that failed ends earlier
     first = next(iter(motions.values()))
     meshes = [(name, motion.vertices[:frames], motion.faces) for name, motion in motions.items()]
     surfaces = [motion.surface for motion in motions.values()]
-    write_usd(next(iter(outputs.values())), meshes, first.fps, surfaces, start=first.clock.number)
+    write_together(next(iter(outputs.values())), meshes, first.fps, surfaces, start=first.clock.number)

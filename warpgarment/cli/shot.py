@@ -18,7 +18,7 @@ from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.material import Material
 from warpgarment.objects.wind import Wind
-from warpgarment.view.progress import counted
+from warpgarment.progress import counted
 
 from . import spoken
 from .outdoors import check_read, materials_of, wind_of

@@ -14,9 +14,9 @@ from warpgarment.io.files import whole_output
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.clock import in_words
 from warpgarment.objects.motion import GarmentMotion
+from warpgarment.progress import counted
 from warpgarment.view import draw
 from warpgarment.view.matched import Motion, matched
-from warpgarment.view.progress import counted
 
 from . import spoken
 from .outputs import check_output

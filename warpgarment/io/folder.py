@@ -14,6 +14,7 @@ from warpgarment.io.disk.atomic import atomic_folder
 from warpgarment.io.surface.mtl import mtl_text
 from warpgarment.io.surface.obj import OBJ_KEEPS, has_materials, text_around
 from warpgarment.io.surface.record import of_triangles, say_left_out
+from warpgarment.progress import parts
 
 from .data import Format, Holds, MotionData, ReadOptions
 from .obj import chosen_polygons, obj_holds, obj_text, read_polygons, surface_of
@@ -43,7 +44,7 @@ def read_folder(path: Path, options: ReadOptions) -> MotionData:
     first = read_polygons(files[0])
     used, _, counts, corners = chosen_polygons(files[0], first, options.mesh)
     frames = [first.vertices[used]]
-    for file in files[1:]:
+    for file in parts(files[1:], "reading"):
         found = read_polygons(file, dressed=False)
         same = np.array_equal(found.counts, first.counts) and np.array_equal(found.corners, first.corners)
         if found.vertices.shape != first.vertices.shape or not same:
@@ -130,7 +131,7 @@ def write_folder(path: Path, data: MotionData) -> None:
     with atomic_folder(path, FRAME) as folder:
         if library and data.surface is not None:
             (folder / library).write_text(mtl_text(data.surface, path), encoding="utf-8")
-        for frame, positions in enumerate(data.vertices, first):
+        for frame, positions in enumerate(parts(data.vertices, "writing"), first):
             text = obj_text(positions, data.faces, data.name, around)
             (folder / f"frame_{frame:0{digits}d}.obj").write_text(text, encoding="utf-8")
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from warpgarment.errors import MeshError
 from warpgarment.io.disk.plain import open_plain
+from warpgarment.progress import parts
 
 from .caches.beside import covered, holds_beside, mesh_of, write_covered
 from .data import Format, MotionData, ReadOptions
@@ -75,7 +76,7 @@ def write_pc2_to(path: Path, vertices: np.ndarray, *, start: float = 0.0, sampli
     frames, count = vertices.shape[:2]
     with open(path, "wb") as file:
         file.write(HEADER.pack(SIGNATURE, 1, count, start, sampling, frames))
-        for frame in vertices:
+        for frame in parts(vertices, "writing"):
             file.write(np.ascontiguousarray(frame, dtype="<f4").tobytes())
 
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpgarment.objects.motion import GarmentMotion
+from warpgarment.progress import parts
 
 from .images import caption, titled, write_mp4, write_png
 from .matched import Motion, in_step, matched
@@ -320,7 +321,8 @@ def sheet(
     camera = camera or chase(motions if body is not None else [timed, *motions], size=size)
     strips = []
     for text, garments, colors in rows:
-        panels = film(body, garments, size=size, colors=colors, frames=moments, camera=camera, device=device)
+        drawn = film(body, garments, size=size, colors=colors, frames=moments, camera=camera, device=device)
+        panels = parts(drawn, "drawing", unit="picture", total=len(moments))
         strip = [caption(p, f"{timed.start + t / timed.fps:.1f} s") for p, t in zip(panels, moments, strict=True)]
         strips.append(titled(np.concatenate(strip, axis=1), text))
     picture = np.concatenate(strips, axis=0)

@@ -13,8 +13,9 @@ from warpgarment.errors import MeshError
 from warpgarment.io.data import Holds
 from warpgarment.io.disk.plain import open_plain
 from warpgarment.io.polygons import triangulate_counts
-from warpgarment.io.surface.record import Coordinates, Surface, worth_keeping
+from warpgarment.io.surface.record import NONE, Coordinates, Material, Surface, worth_keeping
 from warpgarment.io.times import moments
+from warpgarment.progress import parts
 
 from .structure import check_structure
 from .writing import CLOSED, modules
@@ -151,7 +152,7 @@ def _read(found: _Found, path: Path, frames: bool) -> AlembicMesh:
         raise MeshError(f"{where}: {len(times):,} samples of {len(first):,} points are more than {LARGEST:,} bytes.")
     vertices = np.empty((len(times), len(first), 3), np.float32)
     fixed = found.schema.getFaceIndicesProperty().isConstant() and found.schema.getFaceCountsProperty().isConstant()
-    for k in range(len(times)):
+    for k in parts(range(len(times)), "reading"):
         sample = k if len(points) > 1 else 0
         placed = first
         if sample and fixed:
@@ -249,4 +250,24 @@ def _surface(schema: Any, counts: np.ndarray, corners: np.ndarray, points: int) 
         if len(places) == points != len(corners):  # of points
             places = places[corners]
         sets = (Coordinates("", pairs, places),)
-    return Surface(counts, corners, sets).turned(np.ones(len(counts), dtype=bool))
+    names, material = _materials(schema, len(counts))
+    found = Surface(counts, corners, sets, tuple(map(Material, names)), material)
+    return found.turned(np.ones(len(counts), dtype=bool))
+
+
+def _materials(schema: Any, polygons: int) -> tuple[list[str], np.ndarray]:
+    """Sets of faces, by name, and the one of each polygon; none where they overlap, as those of materials do not."""
+    names: list[str] = []
+    of_polygon = np.full(polygons, NONE)
+    for name in schema.getFaceSetNames():
+        faces = schema.getFaceSet(name).getSchema()
+        if not faces.getNumSamples():
+            continue
+        mine = np.array(faces.getValue(0).getFaces(), dtype=np.int64).reshape(-1)
+        if len(mine) and (mine.min() < 0 or mine.max() >= polygons):
+            raise MeshError(f"a set of faces, {name!r}, names polygons beyond the {polygons:,} there are.")
+        if (of_polygon[mine] != NONE).any():
+            return [], np.full(polygons, NONE)
+        of_polygon[mine] = len(names)
+        names.append(name)
+    return names, of_polygon

@@ -16,6 +16,7 @@ from warpgarment.errors import MeshError
 from warpgarment.io.data import Format, MotionData, ReadOptions
 from warpgarment.io.disk.plain import open_plain
 from warpgarment.io.times import moments
+from warpgarment.progress import parts
 
 from .beside import covered, holds_beside, mesh_of, write_covered
 
@@ -60,7 +61,7 @@ def write_mdd_to(path: Path, vertices: np.ndarray, times: np.ndarray) -> None:
     with open(path, "wb") as file:
         file.write(HEADER.pack(frames, count))
         file.write(np.asarray(times, dtype=">f4").tobytes())
-        for frame in vertices:
+        for frame in parts(vertices, "writing"):
             file.write(np.asarray(frame, dtype=">f4").tobytes())
 
 

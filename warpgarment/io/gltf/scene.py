@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from warpgarment.progress import parts
+
 from .animation import Channels, local_matrices
 from .container import Document
 from .schema import Damaged
@@ -168,7 +170,7 @@ class Scene:
         blend = csr_matrix((weight.reshape(-1), (rows, index.reshape(-1))), shape=(count, len(joints)))
         frames = max(len(points), *(len(m) for m in world))
         moved = np.empty((frames, count, 3))
-        for t in range(frames):
+        for t in parts(range(frames), "reading"):
             transforms = np.stack([m[min(t, len(m) - 1)] for m in world])[:, :3].reshape(len(joints), 12)
             each = (blend @ transforms).reshape(count, 3, 4)
             moved[t] = np.einsum("vij,vj->vi", each[:, :, :3], points[min(t, len(points) - 1)]) + each[:, :, 3]

@@ -23,6 +23,7 @@ from warpgarment.io.data import MotionData
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.surface.mtl import named_from
 from warpgarment.io.surface.record import NONE, Material, Surface, members, of_triangles
+from warpgarment.progress import parts
 
 FLOAT, INDEX = 5126, 5125
 LARGEST = 2**32 - 1  # bytes of a .glb
@@ -137,7 +138,7 @@ def _primitives(buffer: _Buffer, vertices: np.ndarray, faces: np.ndarray, surfac
         if number != NONE:
             primitive["material"] = number
         if len(vertices) > 1:
-            moves = (frame - positions[0] for frame in positions[1:])
+            moves = (frame - positions[0] for frame in parts(positions[1:], "writing"))
             primitive["targets"] = [{"POSITION": buffer.add(move, bounds=True, target=34962)} for move in moves]
         found.append(primitive)
     return found

@@ -301,7 +301,8 @@ def say_left_out(path: object, surface: Surface | None, *, sets: int = 0, polygo
         surface: What it is made of; None: triangles.
         sets: How many sets of texture coordinates it holds.
         polygons: What becomes of polygons with more than three corners; empty: they stay.
-        keeps: What else it holds: "materials", "objects" and "groups", of which others are left out.
+        keeps: What else it holds: "materials", "names of materials" without colours and pictures, "objects" and
+            "groups", of which others are left out.
     """
     if surface is None:
         return
@@ -315,7 +316,12 @@ def say_left_out(path: object, surface: Surface | None, *, sets: int = 0, polygo
         "groups": surface.groups.used,
     }
     lost += [kind for kind, some in there.items() if some and kind not in keeps]
-    if "materials" in keeps and any(material.embedded for material in surface.materials):
+    if "names of materials" in keeps:
+        if any(
+            (one.color, one.opacity, one.texture) != (None, None, None) or one.embedded for one in surface.materials
+        ):
+            lost.append("colours and pictures of materials")
+    elif "materials" in keeps and any(material.embedded for material in surface.materials):
         lost.append("pictures that were inside the input")
     said = f"left out: {', '.join(lost)}" if lost else ""
     if polygons and (surface.counts != 3).any():

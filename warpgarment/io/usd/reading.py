@@ -15,6 +15,7 @@ from warpgarment.io.disk.plain import check_plain
 from warpgarment.io.polygons import triangulate_counts
 from warpgarment.io.surface.record import Surface, worth_keeping
 from warpgarment.io.times import Frames, frames_of
+from warpgarment.progress import parts
 
 from .looks import surface_of
 from .skeleton import Skinning, skinning_of
@@ -197,7 +198,7 @@ def _frames(stage: Any, prim: Any, skinning: Skinning | None, where: str, UsdGeo
 def _positions(prim: Any, skinning: Skinning | None, times: list, where: str, UsdGeom: Any) -> np.ndarray:
     """World positions, float64 [T,V,3]."""
     found: list[np.ndarray] = []
-    for time in times:
+    for time in parts(times, "reading"):
         points = _array(prim, "points", time, where, columns=3)
         if skinning is not None:
             try:

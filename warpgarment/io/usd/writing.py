@@ -14,6 +14,7 @@ from warpgarment.errors import MeshError, MissingExtra, OutputError
 from warpgarment.geometry.checks import checked_faces, checked_fps, checked_positions
 from warpgarment.io.disk.atomic import atomic_file
 from warpgarment.io.surface.record import Surface, of_triangles
+from warpgarment.progress import parts
 
 from .dressing import Wardrobe, coordinates_name, dress, identifier
 
@@ -87,7 +88,7 @@ def write_usd(
             coordinates = coordinates_name(surface)
             dress(mesh, surface, partial(wardrobe.material, coordinates=coordinates))
             points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
-            for frame, positions in enumerate(vertices):
+            for frame, positions in enumerate(parts(vertices, f"writing {name}")):
                 points.Set(Vt.Vec3fArray.FromNumpy(positions), start + frame)
                 low, high = positions.min(axis=0), positions.max(axis=0)
                 extent.Set(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]), start + frame)
