@@ -4,6 +4,8 @@ The equations are those of compliance.py. S and Z are read in panels of sixteen 
 which Warp's CPU backend compiles to vector instructions (a product with S takes a tenth of the time of a scalar loop).
 One launch, with a thread per component, lists the contacts, computes S, solves, and computes the displacements.
 
+Z is that of compliance.py, with all rows, or has the rows of the contacts only, from compliance_rows.py.
+
 The stopping criterion is that of forces_factor_cpu.py: |c - (I + S) y|, which bounds the error in the energy norm.
 
 | symbol | code | what |
@@ -20,10 +22,12 @@ import warp as wp
 
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
+from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.operator import allocate
 
 from .compliance import Compliance
+from .compliance_rows import Lines, Rows
 
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
 wp.set_module_options({"max_unroll": 1})  # unrolled loops over sixteen would compile longer and run no faster
@@ -40,6 +44,8 @@ def wide_contacts(
     wide: wp.array[wp.int32],
     compliance: wp.array[wp.float32],
     compliance_panels: wp.array[vec16],
+    line_base: wp.array[wp.int32],
+    line_of: wp.array[wp.int32],  # row of Z of each vertex, from `line_base` on; empty: all rows are there
     # In:
     normal: wp.array[wp.vec3d],
     gap: wp.array[wp.float64],
@@ -49,10 +55,14 @@ def wide_contacts(
     # Work:
     panels: wp.array[vec16],
     place: wp.array[wp.int32],
+    line: wp.array[wp.int32],
     nx: wp.array[vec16],
     ny: wp.array[vec16],
     nz: wp.array[vec16],
     image: wp.array[vec16],
+    dx: wp.array[vec16],
+    dy: wp.array[vec16],
+    dz: wp.array[vec16],
     residual: wp.array[wp.float64],
     direction: wp.array[wp.float64],
     solution: wp.array[wp.float64],
@@ -87,6 +97,9 @@ def wide_contacts(
             if n[0] != zero or n[1] != zero or n[2] != zero:
                 c = gap[i]
                 place[slot + count] = k
+                line[slot + count] = k
+                if line_of.shape[0] > 0:
+                    line[slot + count] = line_of[line_base[component] + k]
                 residual[first + count] = c
                 direction[first + count] = c
                 solution[first + count] = zero
@@ -107,21 +120,20 @@ def wide_contacts(
         for m in range(count, 16 * used):
             place[slot + m] = 0
 
-        # S, by panels.
-        for panel in range(used):
-            x = nx[front + panel]
-            y = ny[front + panel]
-            z = nz[front + panel]
-            out = scratch + panel * count
-            for m in range(count):
-                row = base[component] + wp.int64(place[slot + m]) * pitch
+        # S, by panels. A row of Z is read once, since rows are far apart.
+        for m in range(count):
+            row = base[component] + wp.int64(line[slot + m]) * pitch
+            other = front + m / 16
+            r = m % 16
+            across = nx[other][r]
+            up = ny[other][r]
+            along = nz[other][r]
+            for panel in range(used):
                 v = vec16()
-                for r in range(16):
-                    v[r] = compliance[row + wp.int64(place[slot + 16 * panel + r])]
-                other = front + m / 16
-                r = m % 16
-                cosine = nx[other][r] * x + ny[other][r] * y + nz[other][r] * z
-                panels[out + m] = wp.cw_mul(cosine, v)
+                for q in range(16):
+                    v[q] = compliance[row + wp.int64(place[slot + 16 * panel + q])]
+                cosine = across * nx[front + panel] + up * ny[front + panel] + along * nz[front + panel]
+                panels[scratch + panel * count + m] = wp.cw_mul(cosine, v)
 
         goal = tolerance[component] * tolerance[component]
         total = zero
@@ -170,19 +182,30 @@ def wide_contacts(
         for m in range(count):
             force[rows[first + place[slot + m]]] = solution[first + m]
         if count > 0:
-            for panel in range((size + 15) / 16):
-                x = vec16()
-                y = vec16()
-                z = vec16()
-                for m in range(count):
-                    at = (base[component] + wp.int64(place[slot + m]) * pitch) / wp.int64(16) + wp.int64(panel)
-                    v = compliance_panels[at] * wp.float32(solution[first + m])
-                    x += nx[front + m / 16][m % 16] * v
-                    y += ny[front + m / 16][m % 16] * v
-                    z += nz[front + m / 16][m % 16] * v
+            size_in_panels = (size + 15) / 16
+            for panel in range(size_in_panels):
+                dx[front + panel] = vec16()
+                dy[front + panel] = vec16()
+                dz[front + panel] = vec16()
+            for m in range(count):
+                at = int((base[component] + wp.int64(line[slot + m]) * pitch) / wp.int64(16))
+                y_m = wp.float32(solution[first + m])
+                across = nx[front + m / 16][m % 16]
+                up = ny[front + m / 16][m % 16]
+                along = nz[front + m / 16][m % 16]
+                for panel in range(size_in_panels):
+                    v = compliance_panels[at + panel] * y_m
+                    dx[front + panel] = dx[front + panel] + across * v
+                    dy[front + panel] = dy[front + panel] + up * v
+                    dz[front + panel] = dz[front + panel] + along * v
+            for panel in range(size_in_panels):
                 for r in range(16):
                     if 16 * panel + r < size:
-                        d = wp.vec3d(wp.float64(x[r]), wp.float64(y[r]), wp.float64(z[r]))
+                        d = wp.vec3d(
+                            wp.float64(dx[front + panel][r]),
+                            wp.float64(dy[front + panel][r]),
+                            wp.float64(dz[front + panel][r]),
+                        )
                         increment[rows[first + 16 * panel + r]] = d
         report[component] = wp.where(running, -iteration, iteration)
         error[component] = wp.sqrt(rr)
@@ -201,10 +224,55 @@ def solve(
     error: torch.Tensor,
 ) -> torch.Tensor:
     """Forces y, float64 [V], of the components with a compliance matrix; arguments as in `forces_factor_cpu.solve`."""
+    empty = torch.empty(0, dtype=torch.int32)
+    where = model.base, model.room, model.wide, model.values, empty, empty
+    solved = normal, gap, tolerance, relative, max_iterations, increment, report, error
+    return _solve(system, *where, model.scratch, model.panels, *solved)
+
+
+def solve_by_rows(
+    system: System,
+    factor: Factor,
+    rows: Rows,
+    lines: Lines,
+    normal: torch.Tensor,
+    gap: torch.Tensor,
+    tolerance: torch.Tensor,
+    relative: float,
+    max_iterations: int,
+    increment: torch.Tensor,
+    report: torch.Tensor,
+    error: torch.Tensor,
+) -> torch.Tensor:
+    """The same of the components whose contacts have rows, the result `lines` of `compliance_rows.lines_of`."""
+    where = lines.base, lines.scratch, rows.wide, rows.values, factor.base, rows.slot
+    solved = normal, gap, tolerance, relative, max_iterations, increment, report, error
+    return _solve(system, *where, lines.entries, rows.panels, *solved)
+
+
+def _solve(
+    system: System,
+    base: torch.Tensor,
+    room: torch.Tensor,
+    wide: torch.Tensor,
+    values: torch.Tensor,
+    line_base: torch.Tensor,
+    line_of: torch.Tensor,
+    scratch: int,
+    panels: int,
+    normal: torch.Tensor,
+    gap: torch.Tensor,
+    tolerance: torch.Tensor,
+    relative: float,
+    max_iterations: int,
+    increment: torch.Tensor,
+    report: torch.Tensor,
+    error: torch.Tensor,
+) -> torch.Tensor:
     vertices, device = len(normal), normal.device
-    coupling = allocate((model.scratch,), torch.float32, device)
-    place = allocate((16 * model.panels,), torch.int32, device)
-    wide = allocate((4, 16 * model.panels), torch.float32, device)
+    coupling = allocate((scratch,), torch.float32, device)
+    place, line = allocate((2, 16 * panels), torch.int32, device)
+    vectors = allocate((7, 16 * panels), torch.float32, device)
     scalars = allocate((3, vertices), torch.float64, device)
     force = torch.zeros(vertices, dtype=torch.float64, device=device)
 
@@ -214,15 +282,17 @@ def solve(
     with torch_stream(device) as warp_device:
         launch_rows(
             wide_contacts,
-            len(model.base),
+            len(base),
             inputs=[
                 as_argument(system.start, wp.int32),
                 as_argument(system.rows, wp.int32),
-                as_argument(model.base, wp.int64),
-                as_argument(model.room, wp.int64),
-                as_argument(model.wide, wp.int32),
-                as_argument(model.values, wp.float32),
-                of_16(model.values),
+                as_argument(base, wp.int64),
+                as_argument(room, wp.int64),
+                as_argument(wide, wp.int32),
+                as_argument(values, wp.float32),
+                of_16(values),
+                as_argument(line_base, wp.int32),
+                as_argument(line_of, wp.int32),
                 as_argument(normal, wp.vec3d),
                 as_argument(gap, wp.float64),
                 as_argument(tolerance, wp.float64),
@@ -230,7 +300,8 @@ def solve(
                 int(max_iterations),
                 of_16(coupling),
                 as_argument(place, wp.int32),
-                *(of_16(vector) for vector in wide),
+                as_argument(line, wp.int32),
+                *(of_16(vector) for vector in vectors),
                 *(as_argument(vector, wp.float64) for vector in scalars),
                 as_argument(force, wp.float64),
                 as_argument(increment, wp.vec3d),

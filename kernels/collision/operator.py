@@ -6,7 +6,8 @@ A component is solved by the first of these methods for which its solver has the
 | --- | --- | --- |
 | contact forces through the inverse of B | moderate size, CPU | forces_inverse_cpu.py |
 | | moderate size, GPU | forces_inverse_gpu.py |
-| contact forces through a factor of B | larger, CPU | forces_factor_cpu.py |
+| contact forces through rows of the inverse | larger, CPU | compliance_rows.py, forces_inverse_cpu.py |
+| contact forces through a factor of B | with more contacts than there is room for rows, CPU | forces_factor_cpu.py |
 | displacements by conjugate gradients | all others | linear/conjugate_gradients.py |
 """
 
@@ -25,6 +26,7 @@ from warpgarment.kernels.operator import allocate, unpack
 
 from . import forces_factor_cpu, forces_inverse_cpu, forces_inverse_gpu
 from .compliance import Compliance
+from .compliance_rows import Rows, lines_of
 from .contact_set import contact_gap
 
 ADJOINT_TOLERANCE = 1e-6
@@ -43,6 +45,7 @@ class Model(NamedTuple):
     system: System
     dense: Compliance
     factor: Factor
+    rows: Rows
     vertex_component: torch.Tensor
     """Component of each vertex, int32 [V]."""
     one_core: bool
@@ -64,7 +67,7 @@ def _solve(
         D [m], float64 [V,3] (undefined with a load); forces y, or n·λ with a load, float64 [V]; iterations, int32 [C];
         error [m], float64 [C].
     """
-    system, dense, factor, vertex_component, one_core = model
+    system, dense, factor, rows, vertex_component, one_core = model
     count, device = len(tolerance), normal.device
     force = torch.zeros(len(normal), dtype=torch.float64, device=device)
     if dense.inverted + factor.factored < count:
@@ -88,7 +91,12 @@ def _solve(
             forces_inverse_gpu.displace(system, dense, vertex_component, listed, normal, y, increment)
         force += y
     if factor.factored:
-        force += forces_factor_cpu.solve(system, factor, normal, gap, limit, relative, max_iterations, *results)
+        lines = lines_of(system, factor, rows, normal)
+        solved = normal, gap, limit, relative, max_iterations, *results
+        force += forces_inverse_cpu.solve_by_rows(system, factor, rows, lines, *solved)
+        left = torch.where(lines.base < 0, factor.base, -1)
+        if (left >= 0).any():
+            force += forces_factor_cpu.solve(system, factor._replace(base=left), *solved)
     return increment, force, report, error
 
 
@@ -147,7 +155,7 @@ def collision_solve_backward(
     """g - n (n·λ) with A λ = g; n·λ is the force of the contacts for the gap n·(B⁻¹ g)."""
     normal, g = normal.contiguous(), grad.double().contiguous()
     parts = unpack(model, Model)
-    system, dense, factor, vertex_component, _ = parts
+    system, dense, factor, _, vertex_component, _ = parts
     gap = torch.zeros(len(g), dtype=torch.float64, device=g.device)
     if dense.inverted:
         gap = forces_inverse_gpu.respond(system, dense, vertex_component, normal, g)

@@ -42,9 +42,10 @@ from warpgarment.kernels.mesh.laplacian import as_numpy, components, cotangent_l
 from warpgarment.kernels.operator import pack
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
-from . import compliance
+from . import compliance, compliance_rows
 from .body_contacts import BodyContacts
 from .compliance import Compliance
+from .compliance_rows import Rows
 from .contact_set import ContactFrame, Contacts, one_for_each_vertex
 from .operator import Model
 
@@ -70,6 +71,8 @@ class CollisionSolver:
         compliance_budget: Limit of the entries of all inverses together, 4 bytes each; a solve needs the same again.
         factor_budget: Limit of the entries of the factors of B, 12 bytes each, through which all other components are
             solved on a CPU. Components whose factor does not fit are solved by conjugate gradients for displacements.
+        row_budget: Limit of the entries of the rows of inverses that these components keep, 4 bytes each. Components
+            with more contacts than that are solved through the factor alone.
         one_core: Whether solves use the kernels for one CPU core; None does so on a CPU.
 
     Raises:
@@ -88,6 +91,7 @@ class CollisionSolver:
         largest_compliance: int = compliance.LARGEST,
         compliance_budget: int = compliance.BUDGET,
         factor_budget: int = factor.BUDGET,
+        row_budget: int = compliance_rows.BUDGET,
         one_core: bool | None = None,
     ) -> None:
         expect("rest_vertices", rest_vertices, (None, 3))
@@ -106,7 +110,9 @@ class CollisionSolver:
         dense = Compliance.build(base.tocsr(), system, largest_compliance, compliance_budget)
         budget = factor_budget if one_core else 0
         factors = Factor.build(base.tocsr(), system, explicit=False, budget=budget, skip=dense.base.cpu().numpy() >= 0)
-        self._model = pack(Model(system, dense, factors, torch.from_numpy(vertex_component).to(device), one_core))
+        rows = Rows.build(system, factors, row_budget)
+        owner = torch.from_numpy(vertex_component).to(device)
+        self._model = pack(Model(system, dense, factors, rows, owner, one_core))
         self._progress = Progress("CollisionSolver")
         self._contacts: torch.Tensor | None = None
         self.vertex_count = vertex_count

@@ -20,7 +20,7 @@ import torch
 
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.kernels.cloth.pairs import PARTNERS
-from warpgarment.kernels.collision import compliance
+from warpgarment.kernels.collision import compliance, compliance_rows
 from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.kernels.linear import factor
 from warpgarment.nn.architecture import architecture
@@ -43,6 +43,7 @@ LANES = 16  # rows of compliance matrices are padded to a multiple of this
 POISSON_FACTOR, COLLISION_FACTOR = 36.0, 85.0  # bytes of a factor for substitution, per V log2 V of a component
 EXPLICIT_FACTOR = 80.0  # bytes of an inverted factor, per V^1.5 of a component
 FACTOR_ENTRY = 12  # bytes of an entry of a factor
+TOUCHED = 0.2  # share of the vertices of a large component that are in contact at some time, and have a row then
 MORE_SPLITS = (2, 4, 8, 16, 32, 64)
 
 
@@ -109,7 +110,7 @@ def predict(
     return Memory(
         {
             **network,
-            "compliance of collisions": blocks,
+            "compliance of collisions": blocks + (_rows(unique) if cpu else 0),
             "factors of the solvers": _factors(unique, cpu),
             "history of features": (1 if cpu else GRAPHED) * 4 * config.history * FEATURES * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
@@ -199,6 +200,15 @@ def _factors(garments: Sequence[Garment], cpu: bool) -> int:
             poisson += POISSON_FACTOR * sparse if cpu else EXPLICIT_FACTOR * size**1.5
             collisions += COLLISION_FACTOR * sparse if cpu and size > compliance.LARGEST else 0.0
     return sum(int(min(n, FACTOR_ENTRY * factor.BUDGET)) for n in (poisson, collisions))
+
+
+def _rows(garments: Sequence[Garment]) -> int:
+    """Bytes of rows of compliance matrices of components that have no such matrix, as in `compliance_rows`."""
+    sizes = np.concatenate([np.bincount(garment.components[0]) for garment in garments])
+    sizes = sizes[sizes > compliance.LARGEST]
+    pitch = -(-sizes // LANES) * LANES
+    room = compliance_rows.BUDGET // max(1, len(sizes)) // np.maximum(pitch, 1)
+    return int(4 * (pitch * np.minimum(np.ceil(TOUCHED * sizes), room)).sum())
 
 
 def _compliance(garments: Sequence[Garment]) -> tuple[int, int, int]:

@@ -22,11 +22,12 @@ TOLERANCE = 2e-5
 SOLVERS = {
     "wide": {},
     "lanes": {"one_core": False},
-    "factor": {"largest_compliance": 0},
+    "rows": {"largest_compliance": 0},
+    "factor": {"largest_compliance": 0, "row_budget": 0},
     "displacements": {"largest_compliance": 0, "factor_budget": 0},
 }
-"""The ways to solve: for contact forces through the inverse of B as on a CPU and as on a GPU, or through a factor of B,
-and for the displacement by conjugate gradients."""
+"""The ways to solve: for contact forces through the inverse of B as on a CPU and as on a GPU, through rows of it, or
+through a factor of B, and for the displacement by conjugate gradients."""
 
 
 @pytest.fixture(autouse=True)
