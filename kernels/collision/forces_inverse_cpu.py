@@ -17,6 +17,8 @@ The stopping criterion is that of forces_factor_cpu.py: |c - (I + S) y|, which b
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import warp as wp
 
@@ -225,9 +227,8 @@ def solve(
 ) -> torch.Tensor:
     """Forces y, float64 [V], of the components with a compliance matrix; arguments as in `forces_factor_cpu.solve`."""
     empty = torch.empty(0, dtype=torch.int32)
-    where = model.base, model.room, model.wide, model.values, empty, empty
-    solved = normal, gap, tolerance, relative, max_iterations, increment, report, error
-    return _solve(system, *where, model.scratch, model.panels, *solved)
+    found = _Inverse(model.base, model.room, model.wide, model.values, empty, empty, model.scratch, model.panels)
+    return _solve(system, found, normal, gap, tolerance, relative, max_iterations, increment, report, error)
 
 
 def solve_by_rows(
@@ -245,21 +246,26 @@ def solve_by_rows(
     error: torch.Tensor,
 ) -> torch.Tensor:
     """The same of the components whose contacts have rows, the result `lines` of `compliance_rows.lines_of`."""
-    where = lines.base, lines.scratch, rows.wide, rows.values, factor.base, rows.slot
-    solved = normal, gap, tolerance, relative, max_iterations, increment, report, error
-    return _solve(system, *where, lines.entries, rows.panels, *solved)
+    found = _Inverse(
+        lines.base, lines.scratch, rows.wide, rows.values, factor.base, rows.slot, lines.entries, rows.panels
+    )
+    return _solve(system, found, normal, gap, tolerance, relative, max_iterations, increment, report, error)
+
+
+class _Inverse(NamedTuple):
+    base: torch.Tensor
+    room: torch.Tensor
+    wide: torch.Tensor
+    values: torch.Tensor
+    line_base: torch.Tensor
+    line_of: torch.Tensor
+    scratch: int
+    panels: int
 
 
 def _solve(
     system: System,
-    base: torch.Tensor,
-    room: torch.Tensor,
-    wide: torch.Tensor,
-    values: torch.Tensor,
-    line_base: torch.Tensor,
-    line_of: torch.Tensor,
-    scratch: int,
-    panels: int,
+    found: _Inverse,
     normal: torch.Tensor,
     gap: torch.Tensor,
     tolerance: torch.Tensor,
@@ -269,6 +275,7 @@ def _solve(
     report: torch.Tensor,
     error: torch.Tensor,
 ) -> torch.Tensor:
+    base, room, wide, values, line_base, line_of, scratch, panels = found
     vertices, device = len(normal), normal.device
     coupling = allocate((scratch,), torch.float32, device)
     place, line = allocate((2, 16 * panels), torch.int32, device)
