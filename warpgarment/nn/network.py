@@ -15,7 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from warpgarment.kernels.features.channels import FACE, FEATURES, OUTDOOR
+from warpgarment.kernels.deformation.steps import steps
+from warpgarment.kernels.features.channels import FACE, FEATURES, LAYOUT, OUTDOOR
 from warpgarment.kernels.features.outdoor import needs, packed_columns
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
@@ -23,10 +24,11 @@ from warpgarment.objects.pack import PackedGarments
 from . import checkpoint
 from .attention import EncoderLayer
 from .config import STATISTICS, NetworkConfig
+from .heading import rotate_vectors
 from .inputs import FrameInputs, NormalisedOutput, RowInputs, VertexStep
-from .parametrisation import NetworkOutput, Step, compose, context
-from .rows import RowLayout, row_layout
-from .run import run
+from .parametrisation import NetworkOutput, Step, component_mean, compose, context
+from .rows import PaddedView, RowLayout, row_layout
+from .run import normalised, run
 
 
 class GarmentNetwork(nn.Module):
@@ -161,10 +163,37 @@ class GarmentNetwork(nn.Module):
         before = None if inputs.previous is None else inputs.previous[0]
         on = layout.faces, layout.garment_of_face
         outside = packed_columns(self.outdoor, self.config.fps, inputs.vertices, before, *on, inputs.materials, air)
+        if features.device.type == "cpu" and not (torch.is_grad_enabled() or bfloat16):
+            for view in layout.views:
+                self._step(view, view.inputs(features, velocities, outside), features, output)
+            body = component_mean(
+                features[:, -FEATURES:][:, LAYOUT["body_velocity"]], layout.face_component, components
+            )
+            velocity = output.velocity + body if self.config.residual else output.velocity
+            return Step(output.psi, output.singular_values, velocity)
         for view in layout.views:
             view.add_to(output, run(self, view.inputs(features, velocities, outside), bfloat16=bfloat16).output)
         newest = context(features, layout.face_component, components)
         return compose(output, newest, residual=self.config.residual)
+
+    def _step(self, view: PaddedView, rows: RowInputs, features: torch.Tensor, output: NetworkOutput) -> None:
+        """Runs the network on a view and writes its steps: what `predict` does by operators, in a launch."""
+        said, turn = normalised(self, rows)
+        turn = torch.eye(3).expand(len(said.psi), 3, 3) if turn is None else turn
+        scale = [self.psi_std, self.singular_value_std, self.psi_mean, self.singular_value_mean]
+        index = view.face_index if view.face_mask is None else torch.where(view.face_mask, view.face_index, -1)
+        steps(
+            torch.cat([said.psi, said.singular_values], dim=-1),
+            torch.cat(scale),
+            turn.contiguous(),
+            index,
+            features,
+            features.shape[1] - FEATURES + LAYOUT["body_deformation"].start,
+            (output.psi, output.singular_values),
+            residual=self.config.residual,
+        )
+        velocity = rotate_vectors(said.velocity * self.q_std + self.q_mean, turn.mT)
+        view.add_velocities(output.velocity, velocity)
 
     def observed(self, inputs: FrameInputs, layout: Any, after: torch.Tensor) -> dict[str, torch.Tensor]:
         """Numbers of which `statistics` holds the mean and deviation, for a network that predicts positions.

@@ -71,8 +71,12 @@ class PaddedView:
         for target, values in ((packed.psi, rows.psi), (packed.singular_values, rows.singular_values)):
             index, said = _those(self.real_faces, self.face_index, values)
             target[index] = said
-        velocity = rows.velocity * self.share[:, None, None]
-        packed.velocity.index_add_(0, *_those(self.real_components, self.component_index, velocity))
+        self.add_velocities(packed.velocity, rows.velocity)
+
+    def add_velocities(self, packed: torch.Tensor, rows: torch.Tensor) -> None:
+        """Adds these rows' share of the velocities of components to the packed ones, [R,C,3] to [C,3]."""
+        velocity = rows * self.share[:, None, None]
+        packed.index_add_(0, *_those(self.real_components, self.component_index, velocity))
 
 
 class RowLayout(NamedTuple):

@@ -57,6 +57,29 @@ def run(
         bfloat16: Whether `forward_normalised` runs under autocast to bfloat16. Otherwise the caller's autocast applies.
         target: The desired output, in the same space as the inputs; None if there is none.
     """
+    normalised, turn, wanted = _network(network, inputs, noise, bfloat16, target)
+    with torch.autocast(inputs.features.device.type, enabled=False):
+        output = network.denormalise(normalised)
+        if inputs.mirrored is not None:
+            output = mirror_output(output, inputs.mirrored)
+        return Ran(rotate_output(output, turn, inverse=True), normalised, wanted)
+
+
+def normalised(
+    network: GarmentNetwork, inputs: RowInputs, *, bfloat16: bool = False
+) -> tuple[NormalisedOutput, torch.Tensor | None]:
+    """The same without what follows the network, and the rotation of each row to the network's frame, [R,3,3] or None.
+
+    The rows must not be mirrored; the other arguments are those of `run`.
+    """
+    said, turn, _ = _network(network, inputs, 0.0, bfloat16, None)
+    return said, turn
+
+
+def _network(
+    network: GarmentNetwork, inputs: RowInputs, noise: float, bfloat16: bool, target: NetworkOutput | None
+) -> tuple[NormalisedOutput, torch.Tensor | None, NormalisedOutput | None]:
+    """Normalised output, rotation of the rows and normalised target."""
     kind = inputs.features.device.type
     half = bfloat16 or torch.is_autocast_enabled(kind)
     dtype = torch.bfloat16 if bfloat16 else torch.get_autocast_dtype(kind)
@@ -82,13 +105,10 @@ def run(
         x = network.with_outdoor(x, outdoor, inputs.face_mask, embedded=embedded is not None)
     call = network.forward_normalised if embedded is None else network.forward_embedded
     with torch.autocast(kind, dtype=dtype, enabled=half):
-        normalised = call(x, v, inputs.rows, face_mask=inputs.face_mask, component_mask=inputs.component_mask)
+        said = call(x, v, inputs.rows, face_mask=inputs.face_mask, component_mask=inputs.component_mask)
     with torch.autocast(kind, enabled=False):
         wanted = None if target is None else network.normalise_targets(target)
-        output = network.denormalise(normalised)
-        if mirrored is not None:
-            output = mirror_output(output, mirrored)
-        return Ran(rotate_output(output, turn, inverse=True), normalised, wanted)
+    return said, turn, wanted
 
 
 def _turn(network: GarmentNetwork, inputs: RowInputs) -> torch.Tensor | None:
