@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from warpgarment.dressing.dress import Dressed, dress
+    from warpgarment.dressing.dress import Dressed, DressedOutfit, dress
     from warpgarment.nn import checkpoint
     from warpgarment.nn.config import NetworkConfig
     from warpgarment.nn.faces.network import ManifoldAwareTransformer
@@ -38,6 +38,7 @@ __all__ = [
     "BodyMotion",
     "CheckpointError",
     "Dressed",
+    "DressedOutfit",
     "DressingError",
     "Garment",
     "GarmentMotion",
@@ -76,6 +77,7 @@ _HOME = {
     "BodyMotion": "objects.body",
     "CheckpointError": "errors",
     "Dressed": "dressing.dress",
+    "DressedOutfit": "dressing.dress",
     "DressingError": "errors",
     "Garment": "objects.garment",
     "GarmentMotion": "objects.motion",

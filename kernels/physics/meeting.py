@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from warpgarment.kernels.cloth.contacts import Contacts
-from warpgarment.kernels.cloth.pairs import FacePairs, Outfits
+from warpgarment.kernels.cloth.pairs import PARTNERS, FacePairs, Outfits
 from warpgarment.kernels.cloth.steps import safe_steps
 
 MARGIN = 0.006
@@ -25,6 +25,7 @@ class Meeting:
         count: Number of outfits.
         margin: How much farther than their guess vertices may go in a step [m].
         soon: Distance beyond the one to keep at which a pair is watched during a step [m].
+        partners: Room for partners of a face, see `FacePairs`.
 
     Attributes:
         contacts: Pairs of the current step.
@@ -40,8 +41,9 @@ class Meeting:
         *,
         margin: float = MARGIN,
         soon: float = SOON,
+        partners: int = PARTNERS,
     ) -> None:
-        pairs = FacePairs(outfits, points.float(), margin=margin)
+        pairs = FacePairs(outfits, points.float(), margin=margin, partners=partners)
         self._all = torch.ones(len(outfits.rank), dtype=torch.bool, device=points.device)
         self._count, self._pairs, self._outfit_of_vertex, self._margin = count, pairs, outfit_of_vertex, margin
         self.contacts = Contacts(pairs, len(points), thickness=distance + soon, rounds=1)

@@ -89,7 +89,8 @@ def _try(words: list[str], page: str, where: str, capsys) -> None:
         assert words[1:] in (["--help"], ["VERB", "--help"]), where
         return None
     apart = {"--browser", "--dress"} & set(words)  # a server until it is stopped, a minute: tests/view, tests/dressing
-    if apart or page in LONG or page.startswith(CARDS) or RUNS_ON.get(words[1], page) != page:
+    several = words[1] == "dress" and "--body" in words  # a minute: tests/dressing
+    if apart or several or page in LONG or page.startswith(CARDS) or RUNS_ON.get(words[1], page) != page:
         return pages.read_options(words)
     status = pages.run(words)
     assert status in (0, 3), f"{where}: exit status {status}: {capsys.readouterr().err}"

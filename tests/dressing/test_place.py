@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import warpgarment as wg
+from warpgarment.dressing.guesses import Told
 from warpgarment.dressing.limbs import limbs_of
 from warpgarment.dressing.openings import roles_of
-from warpgarment.dressing.place import Told, placed
+from warpgarment.dressing.place import placed
 
 
 @pytest.fixture(scope="module")

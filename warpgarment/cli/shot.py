@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -39,7 +40,7 @@ class Shot:
     out: Output | None = None
     """Where to write: .usd, .abc, .glb, .pc2, .mdd, .npz, or a folder of .obj (no suffix). Polygons, UVs, materials
     and groups of the garment's file stay; glTF has triangles only, and normals are left to whoever shows the result.
-    Several garments go into one .usd, or each into its own file, with {name} for its name: out/{name}.pc2."""
+    Several garments go into one .usd or .abc, or each into its own file, with {name} for its name: out/{name}.pc2."""
     layers: bool = False
     """Keep garments from crossing each other and themselves. The exit status is 3 if the result is not free of
     crossings, or not all of it was looked at."""
@@ -76,8 +77,8 @@ class Shot:
     """The body (same vertices as BODY) as the garment was modelled on it: carries the garment to the first frame. Of a
     .bvh or AMASS motion, BODY itself included, this is its body at rest."""
     dress: bool = False
-    """Put the garment on the body's first frame before, as `warpgarment dress` does: it may have been modelled on
-    another body, in another pose, place or unit."""
+    """Put the garments on the body's first frame before, as `warpgarment dress` does: they may have been modelled on
+    another body, in another pose, place or unit. Several come on over each other; give --layers too."""
     frames: int | None = None
     """Simulate only the first so many frames."""
     out_fps: float | Literal["body", "network"] = "body"
@@ -134,11 +135,8 @@ def checked(
     outputs = {} if shot.out is None else outputs_of(shot.out, pieces, (*shot.files, shot.fit_rest))
     if isinstance(shot.out_fps, float) and not 0 < shot.out_fps < math.inf:
         raise UsageError(f"--out-fps {shot.out_fps:g}: a positive number of frames a second, body or network.")
-    if shot.dress and (len(pieces) > 1 or shot.fit_rest is not None):
-        what = "with --fit-rest" if shot.fit_rest is not None else f"of {len(pieces)} garments"
-        raise UsageError(
-            f"--dress {what}: it puts one garment on the body. Dress each with `warpgarment dress` before."
-        )
+    if shot.dress and shot.fit_rest is not None:
+        raise UsageError("--dress and --fit-rest: both put the garment on the body. Give one of them.")
     known = materials_of(shot.material if materials is None else materials, len(pieces))
     wind = wind_of(shot.wind, shot.wind_file, shot.wind_fps, 30.0)
     return Checked(shot, pieces, outputs, known, wind is not None, pins)
@@ -218,12 +216,14 @@ def _dressed(garments: dict[str, Garment], body: BodyMotion, where: str) -> tupl
     """Garments on the first frame of a body, and their first positions; what was guessed is said."""
     from warpgarment.dressing.dress import dress
 
-    worn = {name: dress(garment, body) for name, garment in garments.items()}
+    worn = dress(list(garments.values()), body, progress=sys.stderr.isatty())
     with spoken(where, scale="--scale", unit="--unit", up="--up"):
-        for name, one in worn.items():
+        for name, one in zip(garments, worn, strict=True):
             for words in (*one.report.notes, *one.report.faults):
                 warnings.warn(f"{name}: {words}", UserWarning, stacklevel=1)
-    return {name: one.garment for name, one in worn.items()}, [one.vertices for one in worn.values()]
+        for words in (fault for pair in worn.report.pairs for fault in pair.faults):
+            warnings.warn(words, UserWarning, stacklevel=1)
+    return dict(zip(garments, worn.outfit, strict=True)), worn.vertices
 
 
 def _fitted(garments: list[Garment], shot: Shot, body: Load, where: str) -> list[Any] | None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .limbs import RINGS, Limb
+from .limbs import RINGS, Limb, Limbs
+from .openings import Roles, line_from
 
 BLEND = 0.04
 """Half the length over which a limb begins to turn, as a share of the height."""
@@ -65,6 +66,34 @@ class Bend:
         result = points.copy()
         result[mine] = between(centres) + _turned(points[mine] - between(self._line), turn)
         return result
+
+
+def bends_of(rest: np.ndarray, faces: np.ndarray, roles: Roles, limbs: Limbs, notes: list[str]) -> list[Bend]:
+    """Limbs that have to lie in sleeves and legs of the garment, with the lines of these.
+
+    Args:
+        rest: Positions of the garment at its place [m], [V,3].
+        faces: Vertex indices, [F,3].
+        roles: What its openings are.
+        limbs: The body's limbs.
+        notes: To which it adds what is not found.
+    """
+    tall, found = limbs.height, []
+    for name, openings, parts in (("arm", roles.arms, limbs.arms), ("leg", roles.legs, limbs.legs)):
+        if openings and not parts:
+            notes.append(f"the body's {name}s were not found: they stay in their pose while it grows.")
+        for limb in parts if openings else ():
+            near = min(openings, key=lambda one: float(np.linalg.norm(one.points(rest).mean(0) - limb.joint)))
+            inwards = line_from(rest, faces, near._replace(centre=near.points(rest).mean(0)), 0.7 * tall, 1.5)
+            way = inwards[0] - limb.joint
+            length = float(np.linalg.norm(way))
+            if length < 0.08 * tall:
+                continue  # an armhole: any arm goes through it
+            along = (inwards - limb.joint) @ way / length
+            inwards = inwards[: int(np.argmax(along < 0.05 * tall)) if (along < 0.05 * tall).any() else None]
+            path = np.concatenate([limb.joint[None], inwards[::-1]])
+            found.append(Bend(limb, path, tall))
+    return found
 
 
 def _ramp(place: np.ndarray) -> np.ndarray:

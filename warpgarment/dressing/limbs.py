@@ -1,4 +1,4 @@
-"""Limbs of a standing body, from its mesh alone: tips, centre lines, and where arms and legs begin.
+"""Limbs of a standing body, from its mesh alone: tips, centre lines, where arms and legs begin, and girths.
 
 The tip of the head is the highest vertex. Feet are the two vertices that are farthest from it, and from each other,
 over the surface. On each side, the hand is the farthest of the vertices above the legs that are farther from the head
@@ -127,6 +127,46 @@ def girth(vertices: np.ndarray, edges: np.ndarray, point: np.ndarray, normal: np
         return float(ConvexHull(np.stack([found @ first, found @ np.cross(normal, first)], 1)).area)  # of 2D: perimeter
     except QhullError:
         return 0.0
+
+
+def girths(vertices: np.ndarray, faces: np.ndarray, limbs: Limbs, around: np.ndarray) -> dict[str, float]:
+    """Length of a tape around the body where each opening may lie [m]; `around` as of `trunk`."""
+    tall, up, edges = limbs.height, np.array([0.0, 1.0, 0.0]), edges_of(faces)
+    found = {}
+    neck = limbs.head.line[max(len(limbs.head.line) - 3, 0)]
+    found["neck"] = girth(vertices, edges, neck, up, 0.1 * tall)
+    for name, pair in (("cuff", limbs.arms), ("leg", limbs.legs)):
+        if pair:
+            at = [limb.line[int(0.6 * (len(limb.line) - 1))] for limb in pair]
+            ways = [limb.line[-1] - limb.line[int(0.3 * (len(limb.line) - 1))] for limb in pair]
+            each = [girth(vertices, edges, p, w, 0.07 * tall) for p, w in zip(at, ways, strict=True)]
+            found[name] = float(np.mean(each))
+    if len(around):
+        found["waist"] = found["top"] = float(around[len(around) // 6 : -len(around) // 4 or None].min())
+        found["hem"] = float(around[: max(len(around) // 2, 1)].max())
+    return {name: size for name, size in found.items() if size > 0}
+
+
+def trunk(vertices: np.ndarray, faces: np.ndarray, limbs: Limbs) -> tuple[np.ndarray, np.ndarray]:
+    """Heights from the crotch to the armpits [m] and the girth of the trunk at each [m], [N] and [N]."""
+    kept = np.ones(len(vertices), bool)
+    for arm in limbs.arms:
+        kept &= ~(arm.reach < arm.end)
+    mine = edges_of(faces[kept[faces].all(1)])
+    low, high = trunk_ends(vertices, limbs)
+    heights = np.linspace(low, high, 33)
+    middle = vertices[kept].mean(0)
+    up = np.array([0.0, 1.0, 0.0])
+    around = [girth(vertices, mine, np.array([middle[0], y, middle[2]]), up, 0.17 * limbs.height) for y in heights]
+    return heights, np.array(around)
+
+
+def trunk_ends(vertices: np.ndarray, limbs: Limbs) -> tuple[float, float]:
+    """Heights of the crotch and of the armpits of a body [m]; `vertices` are its positions [m], [U,3]."""
+    low = vertices[:, 1].min()
+    crotch = np.mean([leg.joint[1] for leg in limbs.legs]) if limbs.legs else low + 0.48 * limbs.height
+    armpit = np.mean([arm.joint[1] for arm in limbs.arms]) - 0.05 * limbs.height if limbs.arms else None
+    return float(crotch), float(low + 0.72 * limbs.height if armpit is None else armpit)
 
 
 def _graph(points: np.ndarray, faces: np.ndarray) -> csr_matrix:

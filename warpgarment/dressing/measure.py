@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import igl
 import numpy as np
 import torch
 
+from warpgarment.geometry.over import sides_of
 from warpgarment.kernels.cloth.contacts import Contacts
 from warpgarment.kernels.cloth.crossings import Crossings, crossings
 from warpgarment.kernels.cloth.pairs import FacePairs, Outfits
@@ -16,6 +18,7 @@ from warpgarment.kernels.sdf.surface_depth import SurfaceDepth, surface_depth
 
 from .limbs import Limb, Limbs
 from .openings import Roles
+from .report import PairReport
 
 
 def crossing_pairs(points: np.ndarray, faces: np.ndarray, body: np.ndarray, body_faces: np.ndarray) -> int:
@@ -31,6 +34,23 @@ def crossing_pairs(points: np.ndarray, faces: np.ndarray, body: np.ndarray, body
     of_face = np.repeat([0, 1], [len(faces), len(body_faces)])
     found = _crossings(both, np.concatenate([faces, body_faces + len(points)]), of_face, itself=False)
     return int(found.layers[0]) + int(found.unseen[0])
+
+
+def pairs_of(layers: Sequence[tuple[str, np.ndarray, np.ndarray]], body: BodyMeshes) -> tuple[PairReport, ...]:
+    """How each pair of garments lies on each other.
+
+    Args:
+        layers: Name, positions [m], [V,3], and vertex indices, [F,3], of each garment, innermost first.
+        body: The body.
+    """
+    found = []
+    for (inner, under, under_faces), (outer, over, over_faces) in itertools.combinations(layers, 2):
+        sheet = BodyMeshes(torch.from_numpy(under.astype(np.float32)), torch.from_numpy(under_faces))
+        none = torch.zeros(len(over), dtype=torch.int32)
+        sides = sides_of(torch.from_numpy(over.astype(np.float32)), none, sheet, body, none)
+        crossing = crossing_pairs(over, over_faces, under, under_faces)
+        found.append(PairReport(inner, outer, crossing, int(sides.above.sum()), int(sides.beneath.sum()), len(over)))
+    return tuple(found)
 
 
 def own_crossings(points: np.ndarray, faces: np.ndarray) -> int:

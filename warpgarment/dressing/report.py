@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from warpgarment.geometry.over import is_wrong
 from warpgarment.view.report import table
 
 DEEP = 2e-3
@@ -108,3 +109,67 @@ class DressReport:
         ]
         text = table(["", self.garment or "garment"], rows)
         return "\n".join([text, *(f"note: {note}" for note in self.notes), *(f"fault: {f}" for f in self.faults)])
+
+
+@dataclass(frozen=True)
+class PairReport:
+    """How two garments lie on each other.
+
+    Attributes:
+        inner: Name of the one that is given first.
+        outer: Name of the other.
+        crossings: Pairs of faces of both that cross.
+        above: Vertices of the outer one that lie over the inner one.
+        beneath: Vertices of the outer one that lie beneath it.
+        vertices: Number of vertices of the outer one.
+    """
+
+    inner: str
+    outer: str
+    crossings: int
+    above: int
+    beneath: int
+    vertices: int
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What is not as it should be, in words."""
+        found = []
+        if self.crossings:
+            found.append(f"{self.crossings:,} pairs of faces of {self.inner} and {self.outer} cross")
+        if is_wrong(self.beneath, self.above, self.vertices):
+            found.append(
+                f"{self.outer} lies beneath {self.inner} at {self.beneath:,} of the {self.beneath + self.above:,} "
+                "vertices where they are over each other"
+            )
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class OutfitReport:
+    """What was done with several garments, and what came of it.
+
+    Attributes:
+        garments: The report of each, innermost first.
+        pairs: How each two of them lie on each other.
+    """
+
+    garments: tuple[DressReport, ...]
+    pairs: tuple[PairReport, ...]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What is not as it should be, in words, of garments and of pairs; empty for an outfit that lies well."""
+        own = [f"{one.garment or 'garment'}: {fault}" for one in self.garments for fault in one.faults]
+        return (*own, *(fault for pair in self.pairs for fault in pair.faults))
+
+    def values(self) -> dict[str, Any]:
+        """The report as plain values, with `faults`."""
+        pairs = [{**asdict(pair), "faults": list(pair.faults)} for pair in self.pairs]
+        return {"garments": [one.values() for one in self.garments], "pairs": pairs, "faults": list(self.faults)}
+
+    def __str__(self) -> str:
+        rows = [[p.inner, p.outer, f"{p.crossings:,}", f"{p.above:,}", f"{p.beneath:,}"] for p in self.pairs]
+        head = ["inner", "outer", "pairs of faces that cross", "vertices over it", "vertices beneath it"]
+        faults = [f"fault: {fault}" for pair in self.pairs for fault in pair.faults]
+        return "\n".join(["\n\n".join([*map(str, self.garments), table(head, rows)]), *faults])

@@ -55,10 +55,12 @@ def write(folder: Path) -> None:
         rest = wg.BodyMotion(stored["rest_vertices"][None], bundle.body.faces)
     _obj(folder / "body_rest.obj", rest.vertices[0], rest.faces)
     _obj(folder / "dress.obj", 100.0 * dress.garment.vertices, dress.garment.faces)
+    (folder / "worn").mkdir()
     for name, garment, first in zip(
         ("inner", "jacket"), bundle.outfit.outfit, bundle.outfit.first_vertices, strict=True
     ):
         _obj(folder / f"{name}.obj", first, garment.faces)
+        wg.Garment(first, garment.faces, name=name).save(folder / "worn" / f"{name}.npz")
     bundle.body.save(folder / "walk.npz")
     bundle.body.save(folder / "dance.npz")
     worn = bundle.outfit.outfit.garments[0]
@@ -71,6 +73,7 @@ def write(folder: Path) -> None:
         ("dress", dress.truth.vertices, dress.garment.faces),
         ("jacket", shirt.truth.vertices, shirt.garment.faces),
     ]
+    write_usd(folder / "own.usd", meshes[:1], 30.0)
     write_usd(folder / "scene.usd", [*meshes, ("body", bundle.body.vertices, bundle.body.faces)], 30.0)
     (folder / "gusts.csv").write_text("0, 0, -1\n0, 0, -3\n0, 0, -6\n")
     job = {"garment": "inner.obj", "body": "walk.npz", "out": "out/job.npz"}

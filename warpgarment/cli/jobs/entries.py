@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
-import math
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -17,11 +15,13 @@ from warpgarment.cli.shot import Checked, Shot, checked
 from warpgarment.errors import MeshError, MissingExtra, UsageError
 from warpgarment.io.data import UNITS
 from warpgarment.io.disk.outputs import names_folder
-from warpgarment.io.disk.plain import JSON_DEEPEST, read_plain
+from warpgarment.io.disk.plain import read_plain
 from warpgarment.io.files import CACHES, listed, suffixes
 
+from . import checks
+from .checks import in_short, key_of, object_of
+
 LARGEST = 256 << 20  # bytes of a list
-LONGEST_LINE = 1 << 20  # characters of a job
 MOST_PINS = 1 << 24  # vertex indices stay below this
 
 
@@ -81,7 +81,7 @@ def read_jobs(path: Path, beside: Shot) -> tuple[list[Job], list[Fault]]:
 
 
 def _job(line: int, row: str, folder: Path, beside: Shot) -> Job:
-    told = {_key(name): value for name, value in _object(row).items()}
+    told = {key_of(name): value for name, value in object_of(row).items()}
     told = {name: value for name, value in told.items() if value is not None}
     unknown = [name for name in told if name not in _KEYS]
     if unknown:
@@ -107,140 +107,37 @@ def _job(line: int, row: str, folder: Path, beside: Shot) -> Job:
     return Job(line, values.get("name") or Path(told["out"]).name or f"line {line}", known, given | told)
 
 
-def _object(row: str) -> dict[str, Any]:
-    """The object of a line, in which no key is there twice."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = [_key(name) for name, _ in pairs]
-        twice = [name for name in names if names.count(name) > 1]
-        if twice:
-            raise UsageError(f"{twice[0]!r} is there twice.")
-        return dict(pairs)
-
-    def refused(word: str) -> Any:
-        raise UsageError(f"{word} is no number of JSON.")
-
-    depth = deepest = 0
-    for bracket in re.findall(r"[\[{\]}]", re.sub(r'"(?:\\.|[^"\\])*"', "", row[:LONGEST_LINE])):
-        depth += 1 if bracket in "[{" else -1
-        deepest = max(deepest, depth)
-    if len(row) > LONGEST_LINE or deepest > JSON_DEEPEST:
-        raise UsageError("too long or too deep for a job.")
-    try:
-        found = json.loads(row, object_pairs_hook=once, parse_constant=refused)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise UsageError(f"no JSON: {error}. A job is one line, keys and texts in double quotes.") from None
-    except UsageError:
-        raise
-    except ValueError as error:  # a number of thousands of digits
-        raise UsageError(f"no JSON: {error}.") from None
-    if not isinstance(found, dict):
-        raise UsageError('no object. A job is a line such as {"garment": "a.obj", "body": "b.npz", "out": "c.usd"}.')
-    return found
-
-
-def _key(name: str) -> str:
-    """A key, in the spelling of Python or of the command line."""
-    return name.lstrip("-").replace("-", "_")
-
-
 def _as_keys(text: str) -> str:
     """A message with keys of jobs in place of options of the command line."""
     return re.sub(r"--(?!weights|device)([a-z][a-z-]*)", lambda found: found[1].replace("-", "_"), text)
 
 
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise UsageError(f"{name!r} must be a number, got {_short(value)}.")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise UsageError(f"{name!r} must be a finite number, got {_short(value)}.")
-    return number
-
-
-def _positive(name: str, value: Any) -> float:
-    if _number(name, value) <= 0:
-        raise UsageError(f"{name!r} must be positive, got {_short(value)}.")
-    return float(value)
-
-
-def _count(name: str, value: Any) -> int:
-    if _number(name, value) < 1 or value != int(value):
-        raise UsageError(f"{name!r} must be a whole number of at least 1, got {_short(value)}.")
-    return int(value)
-
-
-def _text(name: str, value: Any) -> str:
-    if not isinstance(value, str) or not value.strip() or "\0" in value:
-        raise UsageError(f"{name!r} must be a text, got {_short(value)}.")
-    return value
-
-
-def _texts(name: str, value: Any) -> tuple[str, ...]:
-    values = value if isinstance(value, list) else [value]
-    if not values:
-        raise UsageError(f"{name!r} is an empty list.")
-    return tuple(_text(name, item) for item in values)
-
-
-def _flag(name: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise UsageError(f"{name!r} must be true or false, got {_short(value)}.")
-    return value
-
-
-def _one_of(*choices: str) -> Callable[[str, Any], str]:
-    def check(name: str, value: Any) -> str:
-        if value not in choices:
-            raise UsageError(f"{name!r} must be one of {', '.join(choices)}, got {_short(value)}.")
-        return str(value)
-
-    return check
-
-
-def _three(name: str, value: Any) -> tuple[float, ...]:
-    if not isinstance(value, list) or len(value) != 3:
-        raise UsageError(f"{name!r} must be three numbers [x, y, z] in m/s, got {_short(value)}.")
-    return tuple(_number(name, item) for item in value)
-
-
-def _rate(name: str, value: Any) -> Any:
-    return value if value in ("body", "network") else _positive(name, value)
-
-
-def _any(name: str, value: Any) -> Any:
-    return value
-
-
 _KEYS: dict[str, Callable[[str, Any], Any]] = {
-    "garment": _texts,
-    "garments": _texts,
-    "body": _text,
-    "out": _text,
-    "name": _text,
-    "pins": _any,
-    "layers": _flag,
-    "material": _any,
-    "materials": _any,
-    "wind": _three,
-    "wind_file": _text,
-    "wind_fps": _positive,
-    "unit": _one_of(*UNITS),
-    "body_unit": _one_of(*UNITS),
-    "up": _one_of("y", "z"),
-    "body_up": _one_of("y", "z"),
-    "body_fps": _positive,
-    "garment_mesh": _texts,
-    "body_mesh": _text,
-    "body_shape": _text,
-    "clean": _flag,
-    "fit_rest": _text,
-    "dress": _flag,
-    "frames": _count,
-    "out_fps": _rate,
+    "garment": checks.texts,
+    "garments": checks.texts,
+    "body": checks.text,
+    "out": checks.text,
+    "name": checks.text,
+    "pins": checks.anything,
+    "layers": checks.flag,
+    "material": checks.anything,
+    "materials": checks.anything,
+    "wind": checks.three,
+    "wind_file": checks.text,
+    "wind_fps": checks.positive,
+    "unit": checks.one_of(*UNITS),
+    "body_unit": checks.one_of(*UNITS),
+    "up": checks.one_of("y", "z"),
+    "body_up": checks.one_of("y", "z"),
+    "body_fps": checks.positive,
+    "garment_mesh": checks.texts,
+    "body_mesh": checks.text,
+    "body_shape": checks.text,
+    "clean": checks.flag,
+    "fit_rest": checks.text,
+    "dress": checks.flag,
+    "frames": checks.count,
+    "out_fps": checks.rate,
 }
 _PATHS = ("wind_file", "fit_rest")
 _OPTIONS = [field.name for field in fields(Shot) if field.name not in ("files", "out")]
@@ -278,7 +175,9 @@ def _pins(value: Any, files: int, meshes: int) -> list[Any]:
     if value is None:
         return []
     if not isinstance(value, list) or not value:
-        raise UsageError(f"'pins' must be a list of numbers of vertices, or a list of such lists, got {_short(value)}.")
+        raise UsageError(
+            f"'pins' must be a list of numbers of vertices, or a list of such lists, got {in_short(value)}."
+        )
     count = max(files, meshes)
     each = value if any(item is None or isinstance(item, list) for item in value) else [value]
     if len(each) != count:
@@ -287,7 +186,7 @@ def _pins(value: Any, files: int, meshes: int) -> list[Any]:
         if item is not None and not (
             isinstance(item, list) and all(type(vertex) is int and 0 <= vertex < MOST_PINS for vertex in item)
         ):
-            raise UsageError(f"'pins' must be numbers of vertices, counted from 0, got {_short(item)}.")
+            raise UsageError(f"'pins' must be numbers of vertices, counted from 0, got {in_short(item)}.")
     return each
 
 
@@ -349,8 +248,3 @@ def _plain(value: Any) -> Any:
         if isinstance(value, Path)
         else value
     )
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 60 else f"{text[:57]}..."
