@@ -36,11 +36,15 @@ from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_s
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import BEYOND, Bodies, closest_on_body
+from .closest import BEYOND, Bodies, closest_on_body, has_tree
 from .nearest_face import closest_on_triangle
+from .tree import Tree
+from .tree_search import boxes_in_box, least, least_above, stack64, triangles_above
 
 STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""
+ROOM = wp.constant(0.01001)
+"""Margin of the box around a face in which its tips are [m], a little more than l."""
 ROUNDING = wp.constant(2.0e-6)
 """Lengths [m] that are in a ball by less than this are examined."""
 
@@ -60,6 +64,57 @@ def depth_at(bodies: Bodies, b: int, point: wp.vec3) -> float:
     if sign < 0.0:
         depth = wp.float32(wp.length(wp.vec3d(point) - closest))
     return depth
+
+
+@wp.func
+def foot_of_tips(
+    x: wp.vec3, y: wp.vec3, z: wp.vec3, normal: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, most: float, foot: wp.vec3
+):
+    """The corner of a body face that stands out of xyz by more than `most`, if any: by how much, and its foot."""
+    if wp.dot(wp.cross(b - a, c - a), normal) > 0.0:
+        for k in range(3):
+            tip = wp.where(k == 0, a, wp.where(k == 1, b, c))
+            height = wp.dot(normal, tip - x)
+            if height > 0.0 and height < STANDS_OUT * wp.length(normal):
+                nearest = wp.vec3(closest_on_triangle(wp.vec3d(tip), wp.vec3d(x), wp.vec3d(y), wp.vec3d(z)))
+                away = wp.length(tip - nearest)
+                if away > most and away < STANDS_OUT:
+                    most = away
+                    foot = nearest
+    return most, foot
+
+
+@wp.func
+def foot_by_tree(tree: Tree, b: int, x: wp.vec3, y: wp.vec3, z: wp.vec3, normal: wp.vec3, low: wp.vec3, high: wp.vec3):
+    """The point c of a face of the garment; the body's faces are searched in the trees of tree.py."""
+    most = wp.float32(0.0)
+    foot = wp.vec3(wp.nan)
+    thick = STANDS_OUT * wp.length(normal)
+    nodes = stack64()
+    nodes[0] = tree.nodes[b]
+    top = wp.int32(1)
+    while top > 0:
+        top -= 1
+        node = nodes[top]
+        lanes = boxes_in_box(tree.boxes, node, low, high)
+        first = tree.children[node]
+        child = least(lanes)
+        while child < 8:
+            if first < 0:
+                leaf = ~first + child
+                above = triangles_above(tree.corners, leaf, x, normal, thick, low, high)
+                r = least(above)
+                while r < 8:
+                    p = wp.vec3(tree.corners[leaf, 0][r], tree.corners[leaf, 1][r], tree.corners[leaf, 2][r])
+                    q = wp.vec3(tree.corners[leaf, 3][r], tree.corners[leaf, 4][r], tree.corners[leaf, 5][r])
+                    s = wp.vec3(tree.corners[leaf, 6][r], tree.corners[leaf, 7][r], tree.corners[leaf, 8][r])
+                    most, foot = foot_of_tips(x, y, z, normal, p, q, s, most, foot)
+                    r = least_above(above, r)
+            else:
+                nodes[top] = first + child
+                top += 1
+            child = least_above(lanes, child)
+    return foot
 
 
 @wp.kernel(enable_backward=False)
@@ -89,24 +144,30 @@ def feet_of_tips(
     normal = wp.cross(y - x, z - x)
     if not (wp.length(normal) > 0.0 and wp.isfinite(normal)):
         return
-    room = wp.vec3(STANDS_OUT)
-    query = wp.mesh_query_aabb(bodies.meshes[b], wp.min(x, wp.min(y, z)) - room, wp.max(x, wp.max(y, z)) + room)
+    room = wp.vec3(ROOM)
+    low = wp.min(x, wp.min(y, z)) - room
+    high = wp.max(x, wp.max(y, z)) + room
+    if has_tree(bodies):
+        feet[i] = foot_by_tree(bodies.tree, b, x, y, z, normal, low, high)
+        return
+    query = wp.mesh_query_aabb(bodies.meshes[b], low, high)
     face = wp.int32(0)
     most = wp.float32(0.0)
+    foot = wp.vec3(wp.nan)
     while wp.mesh_query_aabb_next(query, face):
         corner = bodies.faces[face + bodies.face_offsets[b]]
-        first = bodies.vertices[corner[0]]
-        outward = wp.cross(bodies.vertices[corner[1]] - first, bodies.vertices[corner[2]] - first)
-        if wp.dot(outward, normal) > 0.0:
-            for k in range(3):
-                tip = bodies.vertices[corner[k]]
-                height = wp.dot(normal, tip - x)
-                if height > 0.0 and height < STANDS_OUT * wp.length(normal):
-                    foot = wp.vec3(closest_on_triangle(wp.vec3d(tip), wp.vec3d(x), wp.vec3d(y), wp.vec3d(z)))
-                    away = wp.length(tip - foot)
-                    if away > most and away < STANDS_OUT:
-                        most = away
-                        feet[i] = foot
+        most, foot = foot_of_tips(
+            x,
+            y,
+            z,
+            normal,
+            bodies.vertices[corner[0]],
+            bodies.vertices[corner[1]],
+            bodies.vertices[corner[2]],
+            most,
+            foot,
+        )
+    feet[i] = foot
 
 
 @wp.kernel(enable_backward=False)

@@ -78,9 +78,9 @@ ONE, MANY = garment(32, 17), [garment(around, 13) for around in (12, 16, 22, 24,
 def test_prediction(garments, config, options):
     """A batch that fits would be refused, or one that does not fit accepted.
 
-    Factor 1.5 of torch's count, set-up included. Geodesic distances and factors lie in NumPy's memory and are counted
-    apart. The last three have too many vertices for a compliance matrix, the last two too many faces for a matrix of
-    all pairs of them.
+    Factor 1.5 of torch's count, set-up included. Geodesic distances, factors and rows of the compliance lie in NumPy's
+    memory and are counted apart; of the rows, one frame takes no more than is predicted. The last three have too many
+    vertices for a compliance matrix, the last two too many faces for a matrix of all pairs of them.
     """
     motion = walk(2)
     splits = {k: v for k, v in options.items() if k == "face_splits"}
@@ -105,7 +105,10 @@ def test_prediction(garments, config, options):
     predicted = memory.predict(garments, [motion], config, **options)
     assert predicted.parts.get("geodesic distances", 0) == distances
     assert 1 / FACTOR < predicted.parts["factors of the solvers"] / factors < FACTOR
-    ratio = (predicted.total - predicted.parts["bodies"]) / measured
+    rows = unpack(scenes[0].contact.solver._model, Model).rows
+    kept = 4 * sum(int(used) * (len(rows.values) // max(1, int(rows.capacity.sum()))) for used in rows.used)
+    assert 0 <= kept <= predicted.parts["rows of compliance"]
+    ratio = (predicted.total - predicted.parts["bodies"] - predicted.parts["rows of compliance"]) / measured
     assert 1 / FACTOR < ratio < FACTOR, f"{predicted}, measured {measured / 1e6:.1f} MB"
 
 

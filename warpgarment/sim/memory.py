@@ -110,7 +110,8 @@ def predict(
     return Memory(
         {
             **network,
-            "compliance of collisions": blocks + (_rows(unique) if cpu else 0),
+            "compliance of collisions": blocks,
+            "rows of compliance": _rows(unique) if cpu else 0,
             "factors of the solvers": _factors(unique, cpu),
             "history of features": (1 if cpu else GRAPHED) * 4 * config.history * FEATURES * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
