@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -62,6 +63,27 @@ def test_help_imports_nothing_heavy() -> None:
     assert set(result.stderr.split()).isdisjoint({"torch", "warp", "numpy", "scipy", "tyro"})
     for verb in ("demo", "simulate", "generate", "dataset", "train", "evaluate", "bench", "view", "convert", "doctor"):
         assert f"\n  {verb}" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("load", "own", "expected"),
+    [
+        (3.0, {}, "1000"),
+        (0.1, {}, None),
+        (3.0, {"OMP_WAIT_POLICY": "ACTIVE"}, None),
+        (3.0, {"GOMP_SPINCOUNT": "7"}, "7"),
+    ],
+)
+def test_threads_do_not_spin_beside_other_work(load, own, expected, monkeypatch, capsys) -> None:
+    """A step of training would take twenty times as long on a shared machine; or a user's own choice be overruled."""
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in own.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, load, load), raising=False)
+    assert cli.main(["convert", "no file", "no file either"]) == 2
+    assert os.environ.get("GOMP_SPINCOUNT") == expected
+    os.environ.pop("GOMP_SPINCOUNT", None)
 
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import re
 import sys
 import warnings
@@ -93,6 +94,22 @@ def usage() -> str:
     )
 
 
+BUSY = 0.5  # cores that other processes had in the last minute, from which on threads are not to spin
+SPINS = "1000"  # what libgomp takes itself where there are more threads than cores; 300,000 otherwise
+
+
+def _let_threads_sleep() -> None:
+    """Lets torch's threads sleep soon when they wait for each other, on a machine that has other work.
+
+    Otherwise they spin for a millisecond or more. Where another process has one of the cores, every operation then
+    waits for a thread whose core is spinning: a step of unrolled training took 90 s in place of 4. Torch reads this
+    when it is imported. What the user has set stays.
+    """
+    busy = hasattr(os, "getloadavg") and os.getloadavg()[0] > BUSY
+    if busy and not os.environ.get("OMP_WAIT_POLICY"):
+        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb.
 
@@ -117,6 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name not in VERBS:
         return _complain(f"there is no verb {arguments[0]!r}. Verbs: {', '.join(VERBS)}.")
 
+    _let_threads_sleep()
     verb = VERBS[name]
     try:
         options = _options(verb, name, arguments[1:])
