@@ -26,6 +26,7 @@ def test_verdicts_follow_from_the_figures_and_name_a_remedy():
     verdicts = [s.verdict for s in motion().status]
     assert verdicts == [wg.Verdict.OK] * 3 + [wg.Verdict.PENETRATING, wg.Verdict.NOT_FINITE]
     assert "wg.fit" in wg.Verdict.PENETRATING.message
+    assert "wg.dress" in wg.Verdict.PENETRATING.message
     assert motion().status[4].message.startswith("Frame 4: ")
 
 

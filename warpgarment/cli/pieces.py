@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from warpgarment.errors import UsageError
 from warpgarment.io.disk.outputs import names_folder
@@ -60,7 +60,11 @@ def pieces_of(files: Sequence[Path], meshes: Sequence[str], *, verb: str = "simu
 
 
 def outputs_of(
-    out: Path, pieces: Sequence[Piece], inputs: Sequence[Path | None], *, writer: str = "write_motion"
+    out: Path,
+    pieces: Sequence[Piece],
+    inputs: Sequence[Path | None],
+    *,
+    writer: Literal["write_mesh", "write_motion"] = "write_motion",
 ) -> dict[str, Path]:
     """Where each garment is written, by its name; all in one file, or each in a file of its own.
 

@@ -8,9 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from warpgarment.errors import UsageError
+from warpgarment.geometry.stride import Narrow, too_narrow
+from warpgarment.objects.body import BodyMotion
+from warpgarment.objects.clearance import clearance
 from warpgarment.objects.clock import in_words
 from warpgarment.objects.facts import Facts
+from warpgarment.objects.garment import Garment
 from warpgarment.objects.motion import GarmentMotion
+from warpgarment.view.deep import depth_lines
 from warpgarment.view.facts import facts_table
 from warpgarment.view.report import certified, rollout_table
 
@@ -88,6 +93,8 @@ def run(options: Simulate) -> int:
     garments, body = shot.garments, shot.body
     shown = {"garment" if len(garments) == 1 else name: Facts.of(garment) for name, garment in garments.items()}
     print(facts_table({**shown, "body": Facts.of(body)}), end="\n\n", flush=True)
+    for name, narrow in _narrow(garments, shot.first, body).items():
+        print(f"warpgarment: {name}: {narrow}", file=sys.stderr)
     simulator = Simulator.from_pretrained(options.weights, device=options.device)
     simulator.timings.synchronise = True
     known.check_read(simulator.network.reads, options.weights)
@@ -99,7 +106,22 @@ def run(options: Simulate) -> int:
     motions = dict(zip(garments, found, strict=True))
     with spoken(out="--out"):
         save(motions, known.outputs)
-    return _told(motions, dict(simulator.timings), known.outputs, options.layers)
+    status = _told(motions, dict(simulator.timings), known.outputs, options.layers)
+    for name, motion in motions.items():
+        for line in depth_lines(motion, body, clearance(garments[name])):
+            print(f"{name}: {line}")
+    return status
+
+
+def _narrow(garments: dict[str, Garment], first: list[Any] | None, body: BodyMotion) -> dict[str, Narrow]:
+    """Garments that are too narrow for the steps of a body, by name."""
+    found = {}
+    for k, (name, garment) in enumerate(garments.items()):
+        start = garment.vertices if first is None else first[k]
+        narrow = too_narrow(garment.vertices, start, garment.faces, body.vertices, body.faces)
+        if narrow is not None:
+            found[name] = narrow
+    return found
 
 
 def _told(motions: dict[str, GarmentMotion], timings: dict[str, float], outputs: dict[str, Path], layers: bool) -> int:

@@ -198,11 +198,12 @@ def dress(
         points = put.points
     meshes = BodyMeshes(*(torch.from_numpy(np.ascontiguousarray(a, t)) for a, t in ((at, "f4"), (faces, "i4"))))
     pieces = []
-    for number, (one, p) in enumerate(zip(found, points, strict=True)):
-        report = report_of(one, p, at, faces, meshes)
-        with _named(one.garment, number, len(garments)):
-            check(p, one.ready.cloth.faces, one.ready.roles, limbs, report)
-        pieces.append(Dressed(one.worn, one.worn.simulated.restored(p.astype(np.float32)), report))
+    for number, (piece, at_end) in enumerate(zip(found, points, strict=True)):
+        report = report_of(piece, at_end, at, faces, meshes)
+        with _named(piece.garment, number, len(garments)):
+            check(at_end, piece.ready.cloth.faces, piece.ready.roles, limbs, report)
+        vertices = piece.worn.simulated.restored(at_end.astype(np.float32))
+        pieces.append(Dressed(piece.worn, vertices, report))
     if isinstance(garment, Garment):
         return pieces[0]
     names = [one.name or f"garment {number}" for number, one in enumerate(garments)]

@@ -26,8 +26,9 @@ class Verdict(enum.Enum):
 _MESSAGES = {
     Verdict.OK: "Every number is finite and nothing of the garment is deep in the body.",
     Verdict.PENETRATING: (
-        "Part of the garment is deep in the body. Start from a garment outside it (wg.fit), raise collision_passes, "
-        "or drop squeezed parts such as hands with BodyMotion.submesh."
+        "Part of the garment is deep in the body. Start from a garment outside it (wg.dress, --dress; wg.fit, "
+        "--fit-rest if it was modelled on this body), raise collision_passes, or drop squeezed parts such as hands "
+        "with BodyMotion.submesh."
     ),
     Verdict.CROSSING: (
         "Triangles of the garment cross each other or another garment of its outfit. Layers that cross in the first "
@@ -36,7 +37,7 @@ _MESSAGES = {
     ),
     Verdict.NOT_FINITE: (
         "The garment holds NaN or infinite positions from this frame on. Check that the garment and the body are in "
-        "metres and that the garment is draped on the body in the first frame (wg.fit)."
+        "metres and that the garment is draped on the body in the first frame (wg.dress, --dress)."
     ),
 }
 

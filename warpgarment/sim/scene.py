@@ -168,7 +168,7 @@ class Scene:
                 raise MeshError(
                     f"garment {name} is {nearest:.2f} m from its body at the nearest vertex. Check that both are in "
                     "metres (Garment.load(..., unit=...)) and Y up, and bring the garment onto the first frame with "
-                    "wg.fit."
+                    "wg.dress (--dress), or with wg.fit (--fit-rest) if it was modelled on this body."
                 )
 
     def inputs(self, now: Frame, features: torch.Tensor, next_body: torch.Tensor) -> FrameInputs:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import socket
 import sys
 import threading
 import time
@@ -23,6 +22,7 @@ from warpgarment.objects.motion import GarmentMotion
 from warpgarment.view import draw
 from warpgarment.view.matched import Motion, matched
 
+from .address import free_port, reached
 from .panel import LivePanel, Panel
 from .parts import Side, centres, place, side_of
 from .playhead import Playhead
@@ -33,7 +33,6 @@ from .turns import Turns
 if TYPE_CHECKING:
     import viser
 
-PORT, TRIED = 8080, 100  # the port that is tried first, and how many after it
 FAR = 0.75  # metres: a body that goes farther is kept in place at first
 SHARE = 0.1  # seconds between two updates of the slider while it plays
 TITLE = "warpgarment"
@@ -103,7 +102,7 @@ def browse(
         ]
         sides.append(side_of("second", shown[len(first) :], seen_body, fitting))
     place(sides)
-    return Browser(sides, shown[0].clock, live, host, _free_port(host, port))
+    return Browser(sides, shown[0].clock, live, host, free_port(host, port))
 
 
 def _waiting(live: Live) -> list[GarmentMotion]:
@@ -113,30 +112,6 @@ def _waiting(live: Live) -> list[GarmentMotion]:
         GarmentMotion(garment.vertices[None], garment.faces, clock.fps, name=garment.name).on_clock(clock)
         for garment in live.garments
     ]
-
-
-def _free_port(host: str, port: int | None) -> int:
-    """A port that can be had.
-
-    Raises:
-        UsageError: There is none, or no such host.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    tried = range(PORT, PORT + TRIED) if port is None else [port]
-    for number in tried:
-        if not 0 <= number < 65536:
-            raise UsageError(f"port {number}: it must be between 0 and 65535.")
-        try:
-            with socket.create_server((host, number), family=family) as found:
-                return int(found.getsockname()[1])
-        except OSError as error:
-            if not isinstance(error, PermissionError) and error.errno not in _TAKEN:
-                raise UsageError(f"the page cannot be served at {host!r}: {error.strerror or error}.") from None
-    listed = f"ports {tried[0]} to {tried[-1]} are" if len(tried) > 1 else f"port {port} is"
-    raise UsageError(f"{listed} taken, or not allowed. Choose another one, or 0 for any that is free.")
-
-
-_TAKEN = {98, 48, 10048, 10013}  # EADDRINUSE of Linux, macOS and Windows, and Windows' refusal
 
 
 class Browser:
@@ -164,7 +139,7 @@ class Browser:
         self.playhead = Playhead(clock.frames, clock.fps)
         with contextlib.redirect_stdout(io.StringIO()):  # viser frames its URL, which is told once here
             self.server = viser.ViserServer(host=host, port=port, label=TITLE, verbose=False)
-        self.url = f"http://{_reached(host)}:{self.server.get_port()}"
+        self.url = f"http://{reached(host)}:{self.server.get_port()}"
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
         self.server.gui.main_panel.dock_right()  # beside the scene, not over it
         self._arrange(self.server, sides)
@@ -297,10 +272,3 @@ class Browser:
         if self.reruns is None:
             raise UsageError("this page shows motions that cannot be run again. Give browse a wg.Rerun.")
         self.reruns.ask(settings)
-
-
-def _reached(host: str) -> str:
-    """The host in a URL that this machine can open."""
-    if host in ("0.0.0.0", "::", ""):
-        return "127.0.0.1"
-    return f"[{host}]" if ":" in host else host
