@@ -83,7 +83,8 @@ class Rows(NamedTuple):
             panels[:-1].astype(np.int32),
         )
         values = torch.from_numpy(np.empty(int(ends[-1]), np.float32))  # takes memory only where rows are written
-        return cls(*(torch.from_numpy(a) for a in host), int(panels[-1]), values)
+        block, begins, most, used, keys, slot, wide = (torch.from_numpy(a) for a in host)
+        return cls(block, begins, most, used, keys, slot, wide, panels=int(panels[-1]), values=values)
 
 
 class Lines(NamedTuple):
@@ -251,7 +252,12 @@ def _make(
             part = slice(at, at + GROUPS)
             given = [
                 torch.from_numpy(np.ascontiguousarray(values))
-                for values in (np.int32(begins[part]), np.int32(counts[part]), places[part], target[part])
+                for values in (
+                    np.array(begins[part], np.int32),
+                    np.array(counts[part], np.int32),
+                    places[part],
+                    target[part],
+                )
             ]
             inputs = [*sweeps, order] + [
                 as_argument(tensor, kind) for tensor, kind in zip(given, (wp.int32,) * 3 + (wp.int64,), strict=True)

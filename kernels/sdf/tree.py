@@ -49,10 +49,14 @@ class Tree:
 
     nodes: wp.array[wp.int32]  # node at which each body begins, its root, and their number, [B + 1]
     children: wp.array[wp.int32]  # first child of each node, or ~leaf where they are leaves
-    boxes: wp.array2d[vec8]  # of each node: lowest x, y, z and highest x, y, z of its children [m]
-    frames: wp.array2d[vec8]  # of each leaf, see the table above
-    corners: wp.array2d[vec8]  # of each leaf: x, y, z of a, b, c [m]
-    faces: wp.array[vec8i]  # of each leaf, counted within the body; -1 in lanes that are not used
+    # of each node: lowest x, y, z and highest x, y, z of its children [m]
+    boxes: wp.array2d[vec8]  # type: ignore[valid-type]
+    # of each leaf, see the table above
+    frames: wp.array2d[vec8]  # type: ignore[valid-type]
+    # of each leaf: x, y, z of a, b, c [m]
+    corners: wp.array2d[vec8]  # type: ignore[valid-type]
+    # of each leaf, counted within the body; -1 in lanes that are not used
+    faces: wp.array[vec8i]  # type: ignore[valid-type]
 
 
 class Shape(NamedTuple):
