@@ -83,8 +83,8 @@ class Rows(NamedTuple):
             panels[:-1].astype(np.int32),
         )
         values = torch.from_numpy(np.empty(int(ends[-1]), np.float32))  # takes memory only where rows are written
-        block, begins, most, used, keys, slot, wide = (torch.from_numpy(a) for a in host)
-        return cls(block, begins, most, used, keys, slot, wide, panels=int(panels[-1]), values=values)
+        of_component, begins, most, used, keys, slot, wide = (torch.from_numpy(a) for a in host)
+        return cls(of_component, begins, most, used, keys, slot, wide, panels=int(panels[-1]), values=values)
 
 
 class Lines(NamedTuple):
