@@ -21,7 +21,8 @@ from warpgarment.kernels.operator import allocate
 from .inside import crossings, is_inside
 from .nearest_face import closest_on_triangle, corners_of, named_face, nearest_on_triangle
 from .tree import Tree
-from .tree_search import crossings_by_tree, nearest_by_tree, on_cpu
+from .tree_rays import crossings_by_tree
+from .tree_search import nearest_by_tree, on_cpu
 
 MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its square is still a finite float32
 # Bodies in pieces: distance, in radii, from which a group of faces is summed as one. On closed bodies 1, 2 and 3 give
