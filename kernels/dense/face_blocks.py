@@ -58,6 +58,17 @@ def embed_block(
 ): ...
 
 
+HEAD = """
+    const int wide_head = (outputs + 31) / 32 * 32;
+    for (int i = 0; i < 32; i++)
+        for (int j = 0; j < wide_head; j++) h[i * wide_head + j] = j < outputs ? head_bias.data[j] : 0.0f;
+    Tiles::begin();
+    Tiles::product(hi, lo, width, (const __bf16*)head.data, 0, width / 32, width / 32, wide_head, h, wide_head);
+    Tiles::end();
+    for (int i = 0; i < many; i++)
+        for (int j = 0; j < outputs; j++) result.data[(at + i) * outputs + j] = h[i * wide_head + j];
+"""
+
 PERCEPTRON = """
     Tiles::begin();
     for (int i = 0; i < 32; i++)
@@ -71,7 +82,7 @@ PERCEPTRON = """
         }
     Tiles::product(hi, lo, hidden, (const __bf16*)contract.data, 0, hidden / 32, hidden / 32, width, c, width);
     Tiles::end();
-    __builtin_memcpy(x, c, 4l * many * width);
+    if (!outputs) __builtin_memcpy(x, c, 4l * many * width);
 """
 
 
@@ -81,7 +92,7 @@ PERCEPTRON = """
         + """
     alignas(64) float h[32 * 256], c[32 * 256];
     alignas(64) __bf16 hi[32 * 256], lo[32 * 256];
-    const int wide = width;
+    const int wide = width, outputs = 0;
     float* x = faces.data + at * width;
     for (int i = 0; i < 32; i++) {
         if (i < many) Tiles::norm(x + i * width, width, c);
@@ -165,7 +176,14 @@ def spread_block(
 """
         + PERCEPTRON
         + """
-    for (int i = 0; i < many; i++) Tiles::norm(x + i * width, width, next.data + (at + i) * width);
+    for (int i = 0; i < many && !outputs; i++) Tiles::norm(c + i * width, width, result.data + (at + i) * width);
+    for (int i = 0; i < 32 && outputs; i++) Tiles::norm(c + i * width, width, c + i * width);
+    if (outputs) {
+        for (int i = 0; i < 32 * width; i += 16) Tiles::split(Tiles::load(c + i), hi + i, lo + i);
+"""
+        + HEAD
+        + """
+    }
 """
     )
 )
@@ -176,14 +194,17 @@ def hear_block(
     hidden: int,
     layouts: int,
     hears: int,
+    outputs: int,
     side: wp.array[wp.int64],
     expand: wp.array[wp.int16],
     expand_bias: wp.array[wp.float32],
     contract: wp.array[wp.int16],
     contract_bias: wp.array[wp.float32],
+    head: wp.array[wp.int16],
+    head_bias: wp.array[wp.float32],
     own: wp.array[wp.float32],
     faces: wp.array[wp.float32],
-    next: wp.array[wp.float32],
+    result: wp.array[wp.float32],
 ): ...
 
 
@@ -191,21 +212,14 @@ def hear_block(
     source(
         PLACE
         + """
-    alignas(64) float c[32 * 256];
+    alignas(64) float h[32 * 256];
     alignas(64) __bf16 hi[32 * 256], lo[32 * 256];
-    const int wide = (outputs + 31) / 32 * 32;
-    for (int i = 0; i < 32; i++) {
+    for (int i = 0; i < 32; i++)
         for (int j = 0; j < width; j += 16)
             Tiles::split(i < many ? Tiles::load(own.data + (at + i) * width + j) : v16{},
                          hi + i * width + j, lo + i * width + j);
-        for (int j = 0; j < wide; j++) c[i * wide + j] = j < outputs ? bias.data[j] : 0.0f;
-    }
-    Tiles::begin();
-    Tiles::product(hi, lo, width, (const __bf16*)weight.data, 0, width / 32, width / 32, wide, c, wide);
-    Tiles::end();
-    for (int i = 0; i < many; i++)
-        for (int j = 0; j < outputs; j++) answer.data[(at + i) * outputs + j] = c[i * wide + j];
 """
+        + HEAD
     )
 )
 def head_block(
@@ -213,8 +227,8 @@ def head_block(
     count: int,
     width: int,
     outputs: int,
-    weight: wp.array[wp.int16],
-    bias: wp.array[wp.float32],
+    head: wp.array[wp.int16],
+    head_bias: wp.array[wp.float32],
     own: wp.array[wp.float32],
-    answer: wp.array[wp.float32],
+    result: wp.array[wp.float32],
 ): ...

@@ -93,35 +93,40 @@ def hear_kernel(
     hidden: wp.int32,
     layouts: wp.int32,
     hears: wp.int32,
+    outputs: wp.int32,
     # Model:
     side: wp.array[wp.int64],
     expand: wp.array[wp.int16],
     expand_bias: wp.array[wp.float32],
     contract: wp.array[wp.int16],
     contract_bias: wp.array[wp.float32],
+    head: wp.array[wp.int16],
+    head_bias: wp.array[wp.float32],
     # In:
     own: wp.array[wp.float32],
     # In and out:
     faces: wp.array[wp.float32],
     # Out:
-    following: wp.array[wp.float32],
+    result: wp.array[wp.float32],
 ):
-    t = from_row + wp.tid()
     hear_block(
-        t,
+        from_row + wp.tid(),
         count,
         width,
         hidden,
         layouts,
         hears,
+        outputs,
         side,
         expand,
         expand_bias,
         contract,
         contract_bias,
+        head,
+        head_bias,
         own,
         faces,
-        following,
+        result,
     )
 
 
@@ -214,27 +219,44 @@ def spread(faces: torch.Tensor, patch: torch.Tensor, share: torch.Tensor, heard:
     return own
 
 
+class Head(NamedTuple):
+    """The last layer."""
+
+    weight: torch.Tensor  # int16, packed, of [O,F]
+    bias: torch.Tensor  # [O]
+
+
 def hear(
-    faces: torch.Tensor, own: torch.Tensor, neighbours: torch.Tensor | None, layer: Perceptron, following: torch.Tensor
+    faces: torch.Tensor,
+    own: torch.Tensor,
+    neighbours: torch.Tensor | None,
+    layer: Perceptron,
+    result: torch.Tensor,
+    last: Head | None = None,
 ) -> None:
     """A layer after the patches.
 
     Args:
-        faces: Faces, shape [R,N,F]; overwritten.
+        faces: Faces, shape [R,N,F]; overwritten, unless this is the last layer but one.
         own: The same, normalised.
         neighbours: Faces across the edges, int64, shape [R,N,3] or [1,N,3]; None for subsets, whose layer has no
             weights for neighbours.
         layer: The weights.
-        following: Room for the result, normalised; other memory than `own`, which neighbours read.
+        result: Room for the new faces, normalised; other memory than `own`, which neighbours read. With `last`, for
+            the outputs [R,N,O] instead.
+        last: The layer after this one, if it is the last.
     """
     sides = torch.zeros((1, 1, SIDES), dtype=torch.int64) if neighbours is None else neighbours
-    sizes = [faces.shape[2], len(layer.expand_bias), len(sides), int(neighbours is not None)]
-    given = [argument(sides), *layer.arguments, argument(own)]
-    _launch(hear_kernel, faces, [*sizes, *given], [faces, following])
+    head = Head(layer.expand, layer.expand_bias) if last is None else last
+    outputs = 0 if last is None else len(last.bias)
+    sizes = [faces.shape[2], len(layer.expand_bias), len(sides), int(neighbours is not None), outputs]
+    given = [argument(sides), *layer.arguments, argument(head.weight), argument(head.bias), argument(own)]
+    _launch(hear_kernel, faces, [*sizes, *given], [faces, result])
 
 
-def head(own: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
-    """The last layer: normalised faces [R,N,F], packed weights and biases [O] -> [R,N,O]."""
+def head(own: torch.Tensor, last: Head) -> torch.Tensor:
+    """The last layer alone: normalised faces [R,N,F] -> [R,N,O]."""
+    weight, bias = last
     answer = allocate((*own.shape[:2], len(bias)), own.dtype, own.device)
     _launch(head_kernel, own, [own.shape[2], len(bias), argument(weight), argument(bias), argument(own)], [answer])
     return answer

@@ -103,11 +103,14 @@ def test_the_layers_after_patches(layouts, monkeypatch):
         heard = torch.cat([own, around], dim=2)
     layer, function = perceptron(heard.shape[2])
     expected = x.double() + function(heard.double())
+    weight, bias = normal(12, WIDTH) / WIDTH**0.5, normal(12)
+    last, answer = faces.Head(packed(weight), bias), torch.full((ROWS, COUNT, 12), torch.nan)
+    faces.hear(x.clone(), own, sides, layer, answer, last)
     faces.hear(x, own, sides, layer, following)
     close(x, expected, OFF)
     close(following, norm(expected), OFF)
-    weight, bias = normal(12, WIDTH) / WIDTH**0.5, normal(12)
-    close(faces.head(own, packed(weight), bias), F.linear(own.double(), weight.double(), bias.double()), OFF)
+    close(faces.head(own, last), F.linear(own.double(), weight.double(), bias.double()), OFF)
+    close(answer, F.linear(norm(expected), weight.double(), bias.double()), OFF)
 
 
 def test_faces_do_not_depend_on_others_of_the_batch():

@@ -57,8 +57,7 @@ class Packed(NamedTuple):
     first: dense.Perceptron
     after: list[dense.Perceptron]  # for faces that hear their neighbours
     alone: list[dense.Perceptron]  # for subsets of faces
-    head: torch.Tensor
-    head_bias: torch.Tensor
+    head: dense.Head
     encoder: tokens.Encoder
 
     def fresh(self) -> bool:
@@ -115,8 +114,7 @@ def _pack(network: PatchTransformer) -> Packed:
         _perceptron(network.before, hears=False),
         [_perceptron(layer, hears=True) for layer in layers],
         [_perceptron(layer, hears=False) for layer in layers],
-        as_tiles(head),
-        head_bias,
+        dense.Head(as_tiles(head), head_bias),
         _encoder(network),
     )
 
@@ -221,8 +219,13 @@ def forward(
     real = None if mask is None else mask.flatten(1)
     heard, velocity = tokens.encode(weights.encoder, faces, given, pools, real)
     own = dense.spread(faces, layout.patch, layout.share, heard)
+    layers = weights.alone if layout.neighbours is None else weights.after
+    if not layers:
+        return dense.head(own, weights.head), velocity
     room = torch.empty_like(own)
-    for layer in weights.alone if layout.neighbours is None else weights.after:
+    for layer in layers[:-1]:
         dense.hear(faces, own, layout.neighbours, layer, room)
         own, room = room, own
-    return dense.head(own, weights.head, weights.head_bias), velocity
+    answer = own.new_empty((*own.shape[:2], len(weights.head.bias)))
+    dense.hear(faces, own, layout.neighbours, layers[-1], answer, weights.head)
+    return answer, velocity
