@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.scenes import tube
 
+import warpgarment as wg
 from warpgarment.geometry.stride import too_narrow
 
 RADIUS, APART, FRAMES = 0.08, 0.2, 11
@@ -48,3 +49,15 @@ def test_one_leg_and_slits_are_no_steps() -> None:
     around = np.arctan2(vertices[:, 2], vertices[:, 0])[faces]
     slit = faces[~((around > -0.2).all(1) & (around < 0.2).all(1))]
     assert too_narrow(vertices, vertices, slit, body, body_faces) is None
+
+
+def test_simulate_tells_which_garment() -> None:
+    """The warning would name another garment of an outfit, or look at its place in the file and not at the start."""
+    from warpgarment.cli.simulate import _narrow
+
+    body, body_faces = _legs(0.5)
+    moving = wg.BodyMotion(body, body_faces, 30.0)
+    narrow, wide = (wg.Garment(*tube(64, 9, bottom=-0.4, top=0.4, radius=(radius, radius))) for radius in (0.2, 0.4))
+    assert list(_narrow({"over": wide, "under": narrow}, None, moving)) == ["under"]
+    away = narrow.vertices + np.float32([3.0, 0.0, 0.0])
+    assert _narrow({"under": narrow}, [away], moving) == {}
