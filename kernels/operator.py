@@ -1,6 +1,6 @@
 """Turns a Warp kernel with one thread per row into a differentiable torch operator.
 
-The operator is a `torch.library.custom_op` with a fake implementation, so `torch.compile` and `torch.export` accept
+The operator (`registered.py`) has a fake implementation, so `torch.compile` and `torch.export` accept
 it; its backward is a second custom operator that launches the kernel's adjoint. Tensors go in and out without copies.
 """
 
@@ -14,6 +14,7 @@ import torch
 import warp as wp
 
 from .launch import as_argument, as_warp, torch_stream
+from .registered import Operator
 
 _Model = TypeVar("_Model")
 Outputs = dict[str, tuple[type, tuple[int, ...]]]  # name -> (Warp element type, shape of one row)
@@ -91,9 +92,7 @@ def row_operator(
     def fake(*tensors: torch.Tensor) -> Any:
         return unpacked(empty_outputs(tensors, torch.empty))
 
-    operator = torch.library.custom_op(
-        f"warpgarment::{name}", forward, mutates_args=(), schema=_schema(names, len(outputs))
-    )
+    operator = Operator(f"warpgarment::{name}", forward, _schema(names, len(outputs)))
     operator.register_fake(fake)
     if not wanted:
         return operator
@@ -127,12 +126,8 @@ def row_operator(
     def fake_backward(*tensors: torch.Tensor) -> Any:
         return unpacked([torch.empty(tensors[i].shape, device=tensors[i].device) for i in wanted])
 
-    backward_operator = torch.library.custom_op(
-        f"warpgarment::{name}_backward",
-        backward,
-        mutates_args=(),
-        schema=_schema(names + [f"grad_{n}" for n in outputs], len(wanted)),
-    )
+    received = names + [f"grad_{n}" for n in outputs]
+    backward_operator = Operator(f"warpgarment::{name}_backward", backward, _schema(received, len(wanted)))
     backward_operator.register_fake(fake_backward)
 
     def save(ctx: Any, inputs: tuple[torch.Tensor, ...], output: Any) -> None:

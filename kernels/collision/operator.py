@@ -23,6 +23,7 @@ from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.operator import allocate, unpack
+from warpgarment.kernels.registered import operator
 
 from . import forces_factor_cpu, forces_inverse_cpu, forces_inverse_gpu
 from .compliance import Compliance
@@ -100,7 +101,7 @@ def _solve(
     return increment, force, report, error
 
 
-@torch.library.custom_op("warpgarment::collision_solve", mutates_args=())
+@operator("warpgarment::collision_solve")
 def collision_solve(
     vertices: torch.Tensor,
     normal: torch.Tensor,
@@ -148,7 +149,7 @@ def _(
     )
 
 
-@torch.library.custom_op("warpgarment::collision_solve_backward", mutates_args=())
+@operator("warpgarment::collision_solve_backward")
 def collision_solve_backward(
     grad: torch.Tensor, normal: torch.Tensor, tolerance: torch.Tensor, model: list[torch.Tensor], max_iterations: int
 ) -> torch.Tensor:

@@ -14,6 +14,7 @@ import warp as wp
 
 from warpgarment.kernels.launch import expect
 from warpgarment.kernels.operator import allocate, launch
+from warpgarment.kernels.registered import operator
 
 from .bending import bending_kernel
 from .cloth import PhysicsCloth
@@ -51,11 +52,7 @@ def _floating(vertices: torch.Tensor) -> torch.dtype:
     return torch.float64 if getattr(vertices, "dtype", None) == torch.float64 else torch.float32
 
 
-@torch.library.custom_op(
-    "warpgarment::cloth_energies",
-    mutates_args=(),
-    schema="(Tensor vertices, Tensor[] model) -> (Tensor, Tensor, Tensor, Tensor)",
-)
+@operator("warpgarment::cloth_energies", "(Tensor vertices, Tensor[] model) -> (Tensor, Tensor, Tensor, Tensor)")
 def _cloth_energies(vertices: torch.Tensor, model: list[torch.Tensor]) -> tuple[torch.Tensor, ...]:
     """Energies [B] and the gradients of their sums [V,3], of the membrane and of bending."""
     faces, inverse_rest, stiffness, hinges, rest_angle, bend, vertex_start = model

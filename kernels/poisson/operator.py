@@ -12,6 +12,7 @@ from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System, block_dim
 from warpgarment.kernels.operator import allocate, unpack
+from warpgarment.kernels.registered import operator
 
 from .kernels import phi_adjoint, place, place_adjoint, right_hand_side
 
@@ -85,7 +86,7 @@ def matrix_of(model: list[torch.Tensor]) -> Matrix:
     return unpack(model[len(MODEL) :], Matrix)
 
 
-@torch.library.custom_op("warpgarment::poisson_solve", mutates_args=())
+@operator("warpgarment::poisson_solve")
 def poisson_solve(
     phi: torch.Tensor,
     mean: torch.Tensor,
@@ -175,7 +176,7 @@ def _(
     )
 
 
-@torch.library.custom_op("warpgarment::poisson_solve_backward", mutates_args=())
+@operator("warpgarment::poisson_solve_backward")
 def poisson_solve_backward(
     grad_vertices: torch.Tensor, mean: torch.Tensor, model: list[torch.Tensor], max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

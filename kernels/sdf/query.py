@@ -27,6 +27,7 @@ import warp as wp
 
 from warpgarment.kernels.launch import expect, torch_stream
 from warpgarment.kernels.operator import allocate, launch
+from warpgarment.kernels.registered import operator
 
 from .bodies import BodyMeshes
 from .closest import query_bodies
@@ -70,7 +71,7 @@ def signed_distance_gradient_kernel(
         wp.atomic_add(grad_vertices, corner[k], wp.vec3(push * weights[k]))
 
 
-@torch.library.custom_op("warpgarment::signed_distance", mutates_args=())
+@operator("warpgarment::signed_distance")
 def _signed_distance(
     points: torch.Tensor, body_vertices: torch.Tensor, body_faces: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -93,7 +94,7 @@ def _(points: torch.Tensor, body_vertices: torch.Tensor, body_faces: torch.Tenso
     )
 
 
-@torch.library.custom_op("warpgarment::signed_distance_backward", mutates_args=())
+@operator("warpgarment::signed_distance_backward")
 def _signed_distance_backward(
     points: torch.Tensor,
     body_vertices: torch.Tensor,
