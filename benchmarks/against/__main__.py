@@ -148,7 +148,8 @@ def shown(row: Row) -> list[str]:
         return [row["what"], "-", "-", f"{row['most']:.4f} {row['unit']}", "-", target, "yes" if row["met"] else "no"]
     times = [f"{row[f'{name}_least']:.3g} / {row[f'{name}_median']:.3g} {row['unit']}" for name in ("before", "now")]
     ratios = [f"{row['ratio']:.2f}", f"{row['ratio_of_medians']:.2f}"]
-    return [row["what"], *times, *ratios, target, "yes" if row["met"] else "no"]
+    met = "-" if row["target"] is None else "yes" if row["met"] else "no"
+    return [row["what"], *times, *ratios, target, met]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
