@@ -39,7 +39,8 @@ from .bodies import BodyMeshes
 from .closest import BEYOND, Bodies, closest_on_body, has_tree
 from .nearest_face import closest_on_triangle
 from .tree import Tree
-from .tree_search import boxes_in_box, least, least_above, stack64, triangles_above
+from .tree_boxes import boxes_in_box, triangles_above
+from .tree_search import least, least_above, stack64
 
 STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""
