@@ -141,7 +141,9 @@ class UnrolledObjective(nn.Module):
         if self.cloth.terms:
             cloth = ClothLosses(self.cloth, batch.scene.packed, batch.materials, fps, batch.counted)
         batch.scene.features.sliding = self.unroll.sliding
-        weight = batch.vertex_weight * certainty(batch, self.unroll.floor)
+        weight = batch.vertex_weight
+        if self.unroll.floor:
+            weight = weight * certainty(batch, self.unroll.floor)
         for terms, vertices, recorded, solved in self.steps(batch):
             found.append(terms)
             if vertices is None:
