@@ -33,7 +33,8 @@ def run(options: Doctor) -> None:
     from warpgarment.kernels import launch  # noqa: F401  (keeps Warp's banner out of the report)
 
     print(f"python {platform.python_version()} on {platform.platform()}")
-    print(", ".join(f"{name} {_version(name)}" for name in _CORE))
+    versions = {name: _version(name) for name in _CORE} | {"torch": torch.__version__}  # with its build, such as +cu130
+    print(", ".join(f"{name} {version}" for name, version in versions.items()))
     wp.init()
     for device in wp.get_devices():
         memory = f", {device.total_memory / 2**30:.0f} GiB" if device.is_cuda else ""
