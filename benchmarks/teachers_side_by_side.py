@@ -1,10 +1,11 @@
 """The physics teachers on one set of scenes: drapes side by side, figures, and checks with known results.
 
-    python -m benchmarks.teachers_side_by_side                        # both teachers, 60 frames
+    python -m benchmarks.teachers_side_by_side                        # all teachers, 60 frames, jersey
     python -m benchmarks.teachers_side_by_side --teachers blender     # only one of them
 
 The scenes are the bundled T-shirt and dress on the bundled walking body, and the T-shirt under a wider one; rest mesh,
 start, material and settling are the same for each teacher. Results are in benchmarks/results/teachers.{png,json,md}.
+Teachers are as far apart as their vertices are, in the mean of all frames.
 
 Stretch is the relative change of edge lengths, of either sign; a vertex is inside if its signed distance to the
 collider is negative (fast winding number); jitter is the mean length of the third difference in time over the cube of a
@@ -18,6 +19,8 @@ import argparse
 import json
 import os
 import time
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import igl
@@ -29,6 +32,7 @@ from warpgarment import demo
 from warpgarment.metrics import layer_collision
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
+from warpgarment.objects.material import Material
 from warpgarment.objects.motion import GarmentMotion
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, make_teacher
 from warpgarment.training.teachers.checks import hanging_strip, pendulum, rest_on_sphere
@@ -37,6 +41,11 @@ from warpgarment.view.markdown import table
 
 RESULTS = Path(__file__).parent / "results"
 WIDER = 0.020  # gap between the T-shirt and the wider one over it [m]
+TINTS = {
+    "newton": [draw.SLATE, draw.OCHRE],
+    "blender": [draw.CORAL, draw.TEAL],
+    "warp": [draw.PLUM, draw.OCHRE],
+}
 NOTE = """Newton's strip is soft because five iterations do not converge. Measured apart, Blender 4.5: strips cut from
 irregular meshes stretch 1.1 to 2.3 times as far as they should (0.93 to 1.03 times with `compression` 1), more than
 this one; on the coarser meshes that the checks take by default, the period is 4.1 % off, since all vertices weigh the
@@ -80,6 +89,15 @@ def scenes(frames: int) -> dict[str, ClothScene]:
 
     tshirt, dress = (bundle.garments[name].garment for name in ("tshirt", "dress"))
     return {"T-shirt": worn(tshirt), "dress": worn(dress), "two T-shirts": worn(tshirt, wider(tshirt))}
+
+
+def of_material(made: dict[str, ClothScene], name: str) -> dict[str, ClothScene]:
+    """The scenes with every cloth of a preset, or of the "default" material."""
+    material = Material() if name == "default" else Material.preset(name)
+    return {
+        key: replace(scene, cloths=tuple(replace(cloth, material=material) for cloth in scene.cloths))
+        for key, scene in made.items()
+    }
 
 
 def simulated(teacher: Teacher, scene: ClothScene) -> tuple[np.ndarray, float]:
@@ -134,20 +152,33 @@ def picture(path: Path, shown: dict[str, dict[str, np.ndarray]], drawn: dict[str
     for name, scene in drawn.items():
         parts = list(zip(scene.cloths, scene.starts, scene.starts[1:], strict=False))
         for teacher, by_name in shown.items():
-            tints = [draw.SLATE, draw.OCHRE] if teacher == "newton" else [draw.CORAL, draw.TEAL]
+            tints = TINTS[teacher]
             motions = [GarmentMotion(by_name[name][:, a:b], c.garment.faces, scene.fps, name=name) for c, a, b in parts]
             rows.append((f"{name}, {teacher}", motions, tints))
     draw.sheet(path, body, rows, frames=6, size=(260, 360))
 
 
-def markdown(about: dict[str, str], rows: list[dict], checks: list[dict], frames: int) -> str:
+def apart(shown: dict[str, dict[str, np.ndarray]]) -> list[dict]:
+    """Mean distance of the vertices of each pair of teachers in each scene [cm]."""
+    found: list[dict] = []
+    for one, other in combinations(shown, 2):
+        for scene, frames in shown[one].items():
+            distance = np.linalg.norm(frames.astype(np.float64) - shown[other][scene], axis=2)
+            found.append({"scene": scene, "teachers": f"{one}, {other}", "mean": 100 * float(distance.mean())})
+    return found
+
+
+def markdown(about: dict[str, str], rows: list[dict], between: list[dict], checks: list[dict], how: str) -> str:
     """The results as tables in Markdown."""
     lines = ["# Physics teachers side by side", "", ", ".join(f"{k} {v}" for k, v in about.items()), ""]
-    lines += [f"`python -m benchmarks.teachers_side_by_side --frames {frames}`, default settings and material.", ""]
+    lines += [f"`python -m benchmarks.teachers_side_by_side {how}`, default settings.", ""]
     cells = [
         [row["scene"], row["teacher"], *(f"{row[name]:.2f}" if name in row else "-" for name in NAMES)] for row in rows
     ]
     lines += table(["scene", "teacher", *NAMES.values()], cells, text=2)
+    if between:
+        cells = [[row["scene"], row["teachers"], f"{row['mean']:.2f}"] for row in between]
+        lines += ["", *table(["scene", "teachers", "apart cm"], cells, text=2)]
     lines += ["", "Against known answers, with default settings:", ""]
     cells = []
     for row in checks:
@@ -163,9 +194,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--teachers", nargs="+", choices=TEACHERS, default=list(TEACHERS))
     parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--material", default="jersey", help="a preset, or default")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    made = scenes(options.frames)
+    made = of_material(scenes(options.frames), options.material)
     shown: dict[str, dict[str, np.ndarray]] = {}
     rows, checks, settings = [], [], {}
     for name in options.teachers:
@@ -188,11 +220,14 @@ def main() -> None:
     checks.sort(key=lambda row: row["check"])
     versions = {p: used[p] for used in settings.values() for p in ("newton", "bpy") if p in used}
     about = {"date": time.strftime("%Y-%m-%d"), **machine(torch.device("cpu")), **versions}
+    how = f"--frames {options.frames} --material {options.material}"
     options.out.mkdir(parents=True, exist_ok=True)
     picture(options.out / "teachers.png", shown, made)
-    everything = {"machine": about, "frames": options.frames, "settings": settings, "rows": rows, "checks": checks}
+    between = sorted(apart(shown), key=lambda row: list(made).index(row["scene"]))
+    everything = {"machine": about, "frames": options.frames, "material": options.material, "settings": settings}
+    everything |= {"rows": rows, "apart": between, "checks": checks}
     (options.out / "teachers.json").write_text(json.dumps(everything, indent=1))
-    (options.out / "teachers.md").write_text(markdown(about, rows, checks, options.frames))
+    (options.out / "teachers.md").write_text(markdown(about, rows, between, checks, how))
     print(f"written {options.out / 'teachers.md'}")
 
 

@@ -25,9 +25,8 @@ import torch
 
 from benchmarks.measure import RESULTS, machine
 from benchmarks.teacher import world
-from benchmarks.teachers_side_by_side import figures, scenes
+from benchmarks.teachers_side_by_side import figures, of_material, scenes
 from warpgarment.io.disk.atomic import atomic_files
-from warpgarment.objects.material import Material
 from warpgarment.training.tables.outfits.crossings import crossing_pairs
 from warpgarment.training.teachers import ClothScene, Teacher
 from warpgarment.training.teachers.newton.settings import NewtonSettings
@@ -134,9 +133,7 @@ def main() -> None:
         "dress, finer": world(1836, options.frames, 0),
         "dress, settled": scenes(options.frames)["dress"],
     }
-    material = Material() if options.material == "default" else Material.preset(options.material)
-    for name, scene in made.items():
-        made[name] = replace(scene, cloths=tuple(replace(cloth, material=material) for cloth in scene.cloths))
+    made = of_material(made, options.material)
     settings = WarpSettings(iterations=options.iterations, tolerance=options.tolerance)
     rows = [row for name, scene in made.items() for row in compared(name, scene, settings, options.newton_converged)]
     about = ", ".join(f"{k} {v}" for k, v in machine(torch.device("cpu")).items())
