@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import copy
+import functools
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import torch
 import warp as wp
 
-from . import threads
+from . import recorded, threads
 
 if wp.config.log_level == wp.LOG_INFO:  # the user's own setting stays; Warp's default prints at every module load
     wp.config.log_level = wp.LOG_WARNING
@@ -68,24 +69,26 @@ def as_argument(tensor: torch.Tensor, dtype: type) -> object:
     The descriptor keeps no memory alive, so the tensor must outlive the launch. A tensor that is not contiguous is
     copied into a Warp array, which keeps the copy alive.
     """
+    if not tensor.is_contiguous():
+        return as_warp(tensor, dtype)
     if tensor.numel() == 0:
         tensor = tensor.new_empty(tensor.shape)  # see as_warp
-    elif not tensor.is_contiguous():
-        return as_warp(tensor, dtype)
     return descriptor(tensor, dtype)
 
 
 def descriptor(tensor: torch.Tensor, dtype: type) -> object:
-    """Address and shape of a tensor as Warp passes them; cached, since most of them recur in every frame."""
-    key = (tensor.data_ptr(), tensor.shape, tensor.stride(), tensor.dtype, dtype)
-    cached = _descriptors.get(key)
-    if cached is None:
+    """Address and shape of a tensor as Warp passes them, from a cached one of the same shape and type."""
+    key = (tensor.shape, tensor.stride(), tensor.dtype, dtype)
+    like = _descriptors.get(key)
+    if like is None:
         if len(_descriptors) >= MOST_DESCRIPTORS:
             _descriptors.clear()
-        cached = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-        cached._ref = None  # otherwise the memory would be kept as long as the descriptor
-        _descriptors[key] = cached
-    return cached
+        like = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+        like._ref = None  # otherwise the memory would be kept as long as the descriptor
+        _descriptors[key] = like
+    made = cast(Any, type(like)).from_buffer_copy(like)
+    made.data = tensor.data_ptr()
+    return made
 
 
 PER_THREAD = 3  # ranges of a launch for each thread: rows near a body take longer than others
@@ -114,20 +117,45 @@ def launch_rows(
     """
     if not rows:
         return
-    parts = min(PER_THREAD * threads.count(), rows // least) if device.is_cpu and threads.count() > 1 else 1
-    if parts < 2:
-        wp.launch(kernel, dim=rows, inputs=[0, *inputs], outputs=outputs, device=device)
+    if not device.is_cpu:
+        wp.launch(kernel, dim=rows, inputs=[0, *inputs, *outputs], device=device)
         return
-    recorded = wp.launch(kernel, dim=rows, inputs=[0, *inputs], outputs=outputs, device=device, record_cmd=True)
-    commands = []
-    for part in range(parts):
-        begin, end = rows * part // parts, rows * (part + 1) // parts
-        command = copy.copy(recorded)
-        command.params, command.fwd_args = list(recorded.params), list(recorded.fwd_args)
-        command.set_dim(end - begin)
-        command.set_param_at_index(0, begin)
-        commands.append(command.launch)
-    threads.spread(commands)
+    parts = min(PER_THREAD * threads.count(), rows // least) if threads.count() > 1 else 1
+    if parts < 2:
+        recorded.launch(kernel, rows, [0, *inputs, *outputs], device)
+        return
+    begins = [rows * part // parts for part in range(parts + 1)]
+    threads.spread(
+        [
+            recorded.prepared(kernel, end - begin, [begin, *inputs, *outputs], device)
+            for begin, end in itertools.pairwise(begins)
+        ]
+    )
+
+
+def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> None:
+    """Launches a kernel over rows; on a CPU by the record of its first launch, on one thread.
+
+    Args:
+        kernel: A kernel of one dimension.
+        rows: Number of threads.
+        arguments: Its arguments, inputs and outputs.
+        device: Warp's device.
+    """
+    if not device.is_cpu:
+        wp.launch(kernel, dim=rows, inputs=arguments, device=device)
+    elif rows:
+        recorded.launch(kernel, rows, arguments, device)
+
+
+def launch_tiled(
+    kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device, *, block_dim: int
+) -> None:
+    """Launches a kernel with a block of lanes for each row; on a CPU a block is one lane. Arguments as of `launch`."""
+    if not device.is_cpu or wp.config.enable_cpu_blocks:
+        wp.launch_tiled(kernel, dim=[rows], inputs=arguments, block_dim=block_dim, device=device)
+    elif rows:
+        recorded.launch(kernel, rows, arguments, device)
 
 
 @contextlib.contextmanager
@@ -137,10 +165,15 @@ def torch_stream(device: torch.device) -> Iterator[wp.Device]:
     Nothing is ever put on Warp's own stream, so the two streams need not be synchronised; a graph capture would refuse
     such a wait.
     """
+    if device.type != "cuda":
+        yield _cpu()
+        return
     wp.init()  # at first use and not at import, so that importing never touches a driver
-    warp_device = wp.device_from_torch(device)
-    if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(device), sync_enter=False):
-            yield warp_device
-    else:
-        yield warp_device
+    with wp.ScopedStream(wp.stream_from_torch(device), sync_enter=False):
+        yield wp.device_from_torch(device)
+
+
+@functools.cache
+def _cpu() -> wp.Device:
+    wp.init()
+    return wp.get_device("cpu")

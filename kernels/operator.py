@@ -14,6 +14,7 @@ import torch
 import warp as wp
 
 from .launch import as_argument, as_warp, torch_stream
+from .launch import launch as run
 from .registered import Operator
 
 _Model = TypeVar("_Model")
@@ -36,13 +37,7 @@ def launch(
     if rows == 0:
         return
     with torch_stream(device) as warp_device:
-        wp.launch(
-            kernel,
-            dim=rows,
-            inputs=[as_argument(tensor, dtype) for tensor, dtype in inputs],
-            outputs=[as_argument(tensor, dtype) for tensor, dtype in outputs],
-            device=warp_device,
-        )
+        run(kernel, rows, [as_argument(tensor, dtype) for tensor, dtype in (*inputs, *outputs)], warp_device)
 
 
 def row_operator(

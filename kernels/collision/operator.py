@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
@@ -115,17 +115,17 @@ def collision_solve(
     vertices, normal, anchor = vertices.contiguous(), normal.contiguous(), anchor.contiguous()
     gap = allocate((len(vertices),), torch.float64, vertices.device)
     with torch_stream(vertices.device) as device:
-        wp.launch(
+        launch(
             contact_gap,
-            dim=len(vertices),
-            inputs=[
+            len(vertices),
+            [
                 as_argument(vertices, wp.vec3),
                 as_argument(normal, wp.vec3d),
                 as_argument(anchor, wp.vec3d),
                 float(distance),
                 as_argument(gap, wp.float64),
             ],
-            device=device,
+            device,
         )
     increment, _, report, error = _solve(unpack(model, Model), normal, gap, tolerance, 0.0, max_iterations)
     return (vertices.double() + increment).to(torch.float32), report, error

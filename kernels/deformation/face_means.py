@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, as_warp, expect, torch_stream
+from warpgarment.kernels.launch import as_argument, as_warp, expect, launch_tiled, torch_stream
 from warpgarment.kernels.operator import allocate
 
 LANES = 256
@@ -83,12 +83,6 @@ class FaceMeans:
         means = allocate((self.count, 3), torch.float32, self.device)
         if self.count:
             with torch_stream(self.device) as warp_device:
-                wp.launch_tiled(
-                    face_means_kernel,
-                    dim=[self.count],
-                    inputs=[self._faces, self._offsets, as_argument(vertices, wp.vec3)],
-                    outputs=[as_argument(means, wp.vec3)],
-                    block_dim=LANES,
-                    device=warp_device,
-                )
+                given = [self._faces, self._offsets, as_argument(vertices, wp.vec3), as_argument(means, wp.vec3)]
+                launch_tiled(face_means_kernel, self.count, given, warp_device, block_dim=LANES)
         return means

@@ -18,7 +18,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .svd import svd
@@ -121,13 +121,8 @@ def next_gradients(
             gradients, values = as_argument(psi, wp.mat33), as_argument(singular_values, wp.vec3)
             owner, marked = as_argument(garment_of_face, wp.int32), as_argument(broken, wp.int32)
             components = as_argument(component_of_face, wp.int32)
-            wp.launch(
-                broken_garments_kernel,
-                dim=rows,
-                inputs=[owner, components, gradients, values, as_argument(velocity, wp.vec3)],
-                outputs=[marked],
-                device=warp_device,
-            )
+            given = [owner, components, gradients, values, as_argument(velocity, wp.vec3)]
+            launch(broken_garments_kernel, rows, [*given, marked], warp_device)
             launch_rows(
                 next_gradients_kernel,
                 rows,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import torch_stream
+from warpgarment.kernels.launch import launch, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .tiles import argument, padded, source
@@ -105,11 +105,6 @@ def turned(weight: torch.Tensor, mean: torch.Tensor, turns: torch.Tensor) -> tup
     result = allocate((rows, 2 * outputs * inputs), torch.int16, weight.device)
     given = [argument(values) for values in (weight, mean, turns)]
     with torch_stream(weight.device) as device:
-        wp.launch(
-            turned_kernel,
-            dim=rows * outputs // VECTOR,
-            inputs=[outputs, frames, channels, *given],
-            outputs=[argument(centre), argument(result)],
-            device=device,
-        )
+        written = [argument(centre), argument(result)]
+        launch(turned_kernel, rows * outputs // VECTOR, [outputs, frames, channels, *given, *written], device)
     return centre, result

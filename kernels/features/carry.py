@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, expect, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .channels import FEATURES, LAYOUT
@@ -91,16 +91,16 @@ def carried(
     expect("features", features, (len(faces), FEATURES), device=device)
     result = allocate(vertices.shape, torch.float32, device)
     with torch_stream(device) as warp_device:
-        wp.launch(
+        launch(
             carried_kernel,
-            dim=len(vertices),
-            inputs=[
+            len(vertices),
+            [
                 as_argument(faces, wp.vec3i),
                 as_argument(face_of_vertex, wp.int32),
                 as_argument(vertices.detach(), wp.vec3),
                 as_argument(features.detach(), wp.float32),
                 as_argument(result, wp.vec3),
             ],
-            device=warp_device,
+            warp_device,
         )
     return result

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, launch_tiled, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System, block_dim
@@ -141,10 +141,10 @@ def poisson_solve(
             device=device,
         )
         increment, report, error = _solve(model, rhs, tensors["tolerance"], 0.0, max_iterations)
-        wp.launch_tiled(
+        launch_tiled(
             place,
-            dim=[count],
-            inputs=[
+            count,
+            [
                 *_start_rows(model),
                 m["kind"],
                 m["centroid_weight"],
@@ -153,8 +153,8 @@ def poisson_solve(
                 as_argument(mean, wp.vec3),
                 as_argument(vertices, wp.vec3),
             ],
+            device,
             block_dim=block_dim(phi.device, len(guess), count),
-            device=device,
         )
     return vertices, report, error
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_warp, expect, torch_stream
+from warpgarment.kernels.launch import as_warp, expect, launch, torch_stream
 from warpgarment.kernels.mesh.caps import caps_of
 
 from . import inside, nearest_face
@@ -163,7 +163,7 @@ class BodyMeshes:
         if loops:
             with torch_stream(self.device) as device:
                 inputs = [self.model.caps, self.model.loops, self.model.vertices]
-                wp.launch(loop_size_kernel, dim=loops, inputs=inputs, outputs=[self.model.loop_size], device=device)
+                launch(loop_size_kernel, loops, [*inputs, self.model.loop_size], device)
 
     def body_of(self, name: str, body: torch.Tensor | None, rows: int) -> torch.Tensor:
         """The body of each of several points, int32 [rows].

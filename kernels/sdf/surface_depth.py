@@ -32,7 +32,7 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
@@ -332,11 +332,7 @@ def surface_depth(
         launch_rows(depth_of_vertices, size, [bodies.model, points, body, float(limit)], found, warp_device)
         inputs = [bodies.model, lines, triangles, points, body, balls, foot]
         launch_rows(depth_between_vertices, len(between), inputs, [rest], warp_device)
-        wp.launch(
-            collect_depth,
-            dim=size + len(between),
-            inputs=[as_argument(garment_of_vertex, wp.int32), lines, triangles, depths, rest],
-            outputs=[as_argument(missing, wp.float32), as_argument(deepest, wp.float32)],
-            device=warp_device,
-        )
+        given = [as_argument(garment_of_vertex, wp.int32), lines, triangles, depths, rest]
+        written = [as_argument(missing, wp.float32), as_argument(deepest, wp.float32)]
+        launch(collect_depth, size + len(between), [*given, *written], warp_device)
     return SurfaceDepth(deepest, missing)

@@ -1,4 +1,4 @@
-"""Descriptors of tensors, which are remembered by address."""
+"""Descriptors of tensors, of which shapes and types are remembered."""
 
 import gc
 import weakref

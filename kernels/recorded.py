@@ -1,0 +1,96 @@
+"""Launches on a CPU by the record of a kernel's first launch, at a fifth of what `wp.launch` costs the host.
+
+`wp.launch` checks and converts every argument in every launch, some 40 microseconds, as long as a small kernel runs
+itself. The first launch of a kernel is recorded by Warp, which checks its arguments. Later ones fill a structure of the
+same types and call the same function:
+
+    recorded launch of a kernel  ->  compiled function, types of its arguments, type of its bounds
+    launch(kernel, rows, arguments)  ->  function(bounds(rows), structure(arguments))
+
+Arguments that do not fit the structure are given to `wp.launch`, which says what is wrong with them. Nothing is
+recorded on a `wp.Tape`: kernels are differentiated by operators of torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import warp as wp
+
+MOST_BOUNDS = 4096
+
+Launch = Callable[[], object]
+
+
+class Record:
+    """What is constant in launches of a kernel on a CPU.
+
+    Args:
+        kernel: A kernel that is not generic.
+        rows: Number of threads of its first launch.
+        arguments: Arguments of its first launch.
+        device: The CPU.
+    """
+
+    def __init__(self, kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> None:
+        self.kept = wp.launch(kernel, dim=rows, inputs=arguments, device=device, record_cmd=True)  # and its module
+        self.forward = self.kept.hooks.forward
+        kinds = [type(value) for value in self.kept.params[1:]]
+        fields = [(f"argument_{k}", kind) for k, kind in enumerate(kinds)]
+        self.structure: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        self.count, self.kind = len(fields), type(self.kept.bounds)
+        self.ones = (1,) * (len(self.kept.bounds.shape) - 1)
+        self.known: dict[int, Any] = {}  # bounds by the number of rows
+
+    def bounds(self, rows: int) -> Any:
+        """Bounds of a launch of that many threads."""
+        found = self.known.get(rows)
+        if found is None:
+            if len(self.known) >= MOST_BOUNDS:
+                self.known.clear()
+            found = self.known[rows] = self.kind((rows, *self.ones))
+        return found
+
+    def filled(self, arguments: Sequence[object]) -> Any:
+        """The structure of a launch; TypeError if an argument does not fit."""
+        if len(arguments) != self.count:
+            raise TypeError("another number of arguments")
+        return self.structure(*[_plain(value) for value in arguments])
+
+
+_records: dict[wp.Kernel, Record] = {}
+
+
+def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> None:
+    """Runs a kernel on a CPU over that many rows, at least one.
+
+    Args:
+        kernel: The kernel; it has one dimension, or further ones of length one.
+        rows: Number of threads.
+        arguments: Its arguments: numbers, descriptors of `launch.as_argument`, Warp's arrays and structures. They have
+            the types of its first launch.
+        device: The CPU.
+    """
+    prepared(kernel, rows, arguments, device)()
+
+
+def prepared(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> Launch:
+    """A call that does the same once it is called, in any thread; the memory of the arguments must live until then."""
+    record = _records.get(kernel)
+    try:
+        if record is None:
+            record = Record(kernel, rows, arguments, device)
+            _records[kernel] = record
+        bounds, filled = record.bounds(rows), record.filled(arguments)
+    except TypeError:
+        wp.launch(kernel, dim=rows, inputs=arguments, device=device)  # says which argument is wrong
+        return lambda: None
+    forward = record.forward
+    return lambda: forward(ctypes.byref(bounds), ctypes.byref(filled))
+
+
+def _plain(value: Any) -> Any:
+    """An argument as ctypes takes it."""
+    return value.__ctype__() if hasattr(value, "__ctype__") else value

@@ -1,0 +1,94 @@
+"""Launches by the record of a kernel's first launch, beside NumPy."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from warpgarment.kernels import recorded
+from warpgarment.kernels.launch import as_argument, as_warp, launch, launch_tiled
+
+
+@wp.struct
+class Line:
+    slope: wp.float32
+    ends: wp.array[wp.vec3]
+
+
+@wp.kernel(enable_backward=False)
+def above(
+    from_row: wp.int32,
+    line: Line,
+    twice: wp.bool,
+    shift: wp.vec3,
+    points: wp.array[wp.vec3],
+    result: wp.array[wp.float64],
+):
+    i = from_row + wp.tid()
+    value = line.slope * points[i][0] + wp.dot(shift, line.ends[0])
+    if twice:
+        value *= 2.0
+    result[i] = wp.float64(value)
+
+
+@wp.kernel(enable_backward=False)
+def lanes(result: wp.array[wp.int32]):
+    row, lane = wp.tid()
+    result[row] += 1 + lane
+
+
+def given(slope: float, twice: bool, count: int) -> tuple[list[object], torch.Tensor, np.ndarray, list[torch.Tensor]]:
+    """Arguments, result, expected numbers and the memory of the arguments."""
+    points, ends = torch.rand(count, 3), torch.rand(1, 3)
+    line, result = Line(), torch.full((count,), torch.nan, dtype=torch.float64)
+    line.slope, line.ends = slope, as_warp(ends, wp.vec3)
+    shift = wp.vec3(1.0, 2.0, 3.0)
+    arguments = [0, line, twice, shift, as_argument(points, wp.vec3), as_argument(result, wp.float64)]
+    expected = (slope * points[:, 0] + ends[0] @ torch.tensor([1.0, 2.0, 3.0])).numpy() * (2.0 if twice else 1.0)
+    return arguments, result, expected, [points, ends]
+
+
+def test_later_launches_take_their_own_arguments():
+    """A launch would read arguments or rows of the one that was recorded. Rounding of three float32 products."""
+    device = wp.get_device("cpu")
+    for slope, twice, count in ((1.5, False, 7), (-2.0, True, 100), (0.25, False, 1)):
+        arguments, result, expected, _memory = given(slope, twice, count)
+        launch(above, count, arguments, device)
+        np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
+    arguments, result, expected, _memory = given(1.0, True, 10)
+    launch(above, 4, [3, *arguments[1:]], device)
+    assert result.isnan().tolist() == [not 3 <= k < 7 for k in range(10)]
+    np.testing.assert_allclose(result.numpy()[3:7], expected[3:7], rtol=1e-5, atol=1e-5)
+
+
+def test_launches_in_several_threads():
+    """Threads would share the arguments of a kernel."""
+    device = wp.get_device("cpu")
+    cases = [given(0.1 * k, k % 2 == 0, 50 + k) for k in range(64)]
+    calls = [recorded.prepared(above, len(result), arguments, device) for arguments, result, _, _ in cases]
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda call: call(), calls))
+    for _, result, expected, _memory in cases:
+        np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_block_of_a_row_is_one_lane():
+    """Rows of a kernel with blocks would be counted as often as there are lanes."""
+    device = wp.get_device("cpu")
+    for rows in (3, 5):
+        result = torch.zeros(rows, dtype=torch.int32)
+        launch_tiled(lanes, rows, [as_argument(result, wp.int32)], device, block_dim=64)
+        assert result.tolist() == [1] * rows
+
+
+def test_arguments_that_do_not_fit_are_refused_as_by_warp():
+    """A wrong argument would be read as memory of another kind."""
+    device = wp.get_device("cpu")
+    arguments, *_memory = given(1.0, False, 5)
+    launch(above, 5, arguments, device)
+    with pytest.raises(RuntimeError, match="passed 5 arguments but kernel requires 6"):
+        launch(above, 5, arguments[:-1], device)
+    with pytest.raises(Exception, match="points"):
+        launch(above, 5, [*arguments[:4], 3.0, arguments[5]], device)
