@@ -139,7 +139,8 @@ class UnrolledObjective(nn.Module):
         fps, before, now = self.network.config.fps, batch.before, batch.vertices
         cloth = None
         if self.cloth.terms:
-            cloth = ClothLosses(self.cloth, batch.scene.packed, batch.materials, fps, batch.counted)
+            scene = batch.scene
+            cloth = ClothLosses(self.cloth, scene.packed, batch.materials, fps, batch.counted, scene.relax.cloth)
         batch.scene.features.sliding = self.unroll.sliding
         weight = batch.vertex_weight
         if self.unroll.floor:
