@@ -25,12 +25,14 @@ forces_inverse_cpu.py on a CPU.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
 import torch
 
+from warpgarment.kernels import kept
 from warpgarment.kernels.linear.factor import component_blocks
 from warpgarment.kernels.linear.system import System
 
@@ -77,10 +79,8 @@ class Compliance(NamedTuple):
             if size > largest or needed + size * pitch > budget:
                 continue
             if key not in known:
-                lower = torch.linalg.cholesky(torch.from_numpy(block.toarray()).to(device))
-                inverse = torch.cholesky_inverse(lower)
-                symmetric = (0.5 * (inverse + inverse.T)).to(torch.float32)
-                blocks.append(torch.nn.functional.pad(symmetric, (0, pitch - size)).ravel())
+                make = partial(_inverted, block, int(pitch - size), device)
+                blocks.append(kept.of("compliance", (*key, str(device)), make))
                 known[key], used = used, used + size * pitch
             base[c], room[c], needed = known[key], needed, needed + size * pitch
         values = torch.cat(blocks) if blocks else torch.empty(0, dtype=torch.float32, device=device)
@@ -88,6 +88,14 @@ class Compliance(NamedTuple):
         device_side = (torch.from_numpy(a).to(device) for a in (base, room, panels[:-1].astype(np.int32)))
         counts = int(needed), int((base >= 0).sum()), int(panels[-1])
         return cls._make((*device_side, *counts, torch.from_numpy(local).to(device), values))
+
+
+def _inverted(block: scipy.sparse.csc_matrix, padding: int, device: torch.device) -> torch.Tensor:
+    """The inverse of a block, float32, row by row with padding at the end of each."""
+    lower = torch.linalg.cholesky(torch.from_numpy(block.toarray()).to(device))
+    inverse = torch.cholesky_inverse(lower)
+    symmetric = (0.5 * (inverse + inverse.T)).to(torch.float32)
+    return torch.nn.functional.pad(symmetric, (0, padding)).ravel()
 
 
 def _pitch(size: int | np.ndarray) -> int | np.ndarray:

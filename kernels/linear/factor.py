@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,11 +41,15 @@ import torch
 import warp as wp
 from scipy.sparse.linalg import splu
 
+from warpgarment.kernels import kept
+
 from .system import System
 
 BUDGET = 2**26
 """Limit of the entries in all factors of a solver together; an entry takes 8 bytes and its index 4 (768 MiB in all)."""
 PANEL = 4
+FILLED = 100
+"""Entries of a factor for each of the matrix: less in any factor of a surface."""
 TRUSTED = 1e-6
 """Error of a trial solve, as a share of its random solution, up to which a factor is used."""
 
@@ -111,7 +116,9 @@ class Factor(NamedTuple):
                 continue
             if key not in known:
                 known[key] = -1
-                part = _factored(block, explicit, budget - used, device)
+                make = partial(_factored, block, explicit, budget - used, device)
+                fits = FILLED * block.nnz < budget - used
+                part = kept.of("factor", (*key, explicit, str(device)), make) if fits else make()
                 if part is not None:
                     known[key], places = places, places + lengths[-1]
                     used += sum(values.size for _, _, values in part[3:])

@@ -8,12 +8,14 @@ each point. The kernels of the queries are in closest.py.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
 import warp as wp
 
+from warpgarment.kernels import kept
 from warpgarment.kernels.launch import as_warp, expect, launch, torch_stream
 from warpgarment.kernels.mesh.caps import caps_of
 
@@ -84,7 +86,9 @@ class BodyMeshes:
         self._faces = faces.detach().clone(memory_format=torch.contiguous_format)
         local = self._faces - first_vertex[:, None]
         host = self._faces.cpu().numpy()
-        caps = caps_of(host, len(vertices), starts)
+        topology = host, len(vertices), tuple(starts), tuple(face_starts)
+        caps = kept.of("caps", topology, partial(caps_of, host, len(vertices), starts))
+        rings = kept.of("rings", topology, partial(nearest_face.rings_of, host, face_starts))
         many = [int(caps.loops[b] - caps.loops[a]) > inside.MOST_CAPS for a, b in pairwise(caps.bodies.tolist())]
         self._meshes: list[wp.Mesh] = []
         with torch_stream(vertices.device):
@@ -112,7 +116,7 @@ class BodyMeshes:
             "face_offsets": (self.face_offsets, wp.int32),
             "faces": (self._faces, wp.vec3i),
             "vertices": (self._vertices, wp.vec3),
-            "rings": (integers(nearest_face.rings_of(host, face_starts)), wp.int32),
+            "rings": (integers(rings), wp.int32),
             "scattered": (integers(many), wp.int32),
             "loop_offsets": (integers(caps.bodies), wp.int32),
             "loops": (integers(caps.loops), wp.int32),

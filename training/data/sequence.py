@@ -216,18 +216,27 @@ class Sequence:
 
     def body_in(self, frames: slice | list[int]) -> BodyMotion:
         """The whole body in the given frames; other frames are not decoded."""
+        vertices = self.body_vertices_in(frames)
+        try:
+            return BodyMotion(vertices, self._array("body_faces"), self.fps)
+        except MeshError as error:
+            raise MeshError(f"{self.name}: body: {error}") from None
+
+    def body_vertices_in(self, frames: slice | list[int], used: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Vertices of the body in the given frames [m], float32 [T,U,3], or those with the indices `used` alone.
+
+        Raises:
+            MeshError: The body cannot be posed.
+        """
         some = {name: array[frames] if name in _OF_FRAMES else array for name, array in self._stored.items()}
         part = Sequence(self.folder, self.manifest, some)
         if "body_positions" in self._stored:
-            vertices = part._array("body_vertices")
-        else:
-            names = "body_rest_vertices", "bone_indices", "bone_weights", "bone_transforms"
-            try:
-                vertices = linear_blend_skinning(*map(part._array, names))
-            except MeshError as error:
-                raise MeshError(f"{self.name}: body: {error}") from None
+            return part._array("body_vertices")[:, used]
+        rest, bones, weights = (
+            part._array(name)[used] for name in ("body_rest_vertices", "bone_indices", "bone_weights")
+        )
         try:
-            return BodyMotion(vertices, self._array("body_faces"), self.fps)
+            return linear_blend_skinning(rest, bones, weights, part._array("bone_transforms"))
         except MeshError as error:
             raise MeshError(f"{self.name}: body: {error}") from None
 

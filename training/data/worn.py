@@ -82,3 +82,7 @@ class WornGarment:
     def body_in(self, frames: slice | list[int]) -> BodyMotion:
         """The whole body in the given frames."""
         return self.whole.body_in(frames)
+
+    def body_vertices_in(self, frames: slice | list[int], used: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Vertices of the body in the given frames [m], [T,U,3], or those with the indices `used` alone."""
+        return self.whole.body_vertices_in(frames, used)

@@ -123,7 +123,7 @@ class SequenceData:
     def body_frames(self, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """The colliding part of the body in some frames: vertices [m], shape [T,U,3], and faces [G,3]."""
         used, faces = self._collider
-        return self.source.body_in(frames).vertices[:, used], faces
+        return self.source.body_vertices_in(frames, used), faces
 
     @cached_property
     def _collider(self) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from warpgarment.kernels.features.channels import INTERACTION
+from warpgarment.kernels.kept import Kept, keeping
 from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import work
@@ -93,6 +94,7 @@ class UnrolledBuilder:
         self.device = sequences[0].device
         self.subsets = architecture(network.config.architecture).subsets
         self.steps, self.collision_passes = steps, collision_passes
+        self._kept = Kept()
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether all K frames after `newest` are recorded."""
@@ -134,19 +136,20 @@ class UnrolledBuilder:
         placed = [
             torch.from_numpy(np.concatenate(parts)).to(device) for parts in zip(*(v for v, _ in bodies), strict=True)
         ]
-        scene = Scene(
-            [data.garment for data in mine],
-            PackedBodies.pack([f for _, f in bodies], [v.shape[1] for v, _ in bodies], range(len(picks)), device),
-            placed[0],
-            torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)]),
-            self.network,
-            face_splits=face_splits,
-            epsilon=None,
-            collision_passes=self.collision_passes,
-            half=False,
-            timings=Timings(device),
-            materials=torch.stack([data.material for data in mine]),
-        )
+        with keeping(self._kept):
+            scene = Scene(
+                [data.garment for data in mine],
+                PackedBodies.pack([f for _, f in bodies], [v.shape[1] for v, _ in bodies], range(len(picks)), device),
+                placed[0],
+                torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)]),
+                self.network,
+                face_splits=face_splits,
+                epsilon=None,
+                collision_passes=self.collision_passes,
+                half=False,
+                timings=Timings(device),
+                materials=torch.stack([data.material for data in mine]),
+            )
         positions, interactions = torch.cat(past, dim=1), torch.cat(rows, dim=1)  # [H,V,3], [H,F,16]
         known = zip(positions, interactions, strict=True)
         features = torch.stack([scene.features.of_interaction(v.contiguous(), unpack(r)) for v, r in known], dim=1)

@@ -85,6 +85,7 @@ class ClothLosses:
         materials: Fields of the material of each, float32 [B,M]; NaN for the default material.
         fps: Frames per second.
         counted: Garments with a recording, bool [B].
+        cloth: Rest state of the garments with these materials, of any mass, if there is one; None: it is made here.
     """
 
     def __init__(
@@ -94,18 +95,20 @@ class ClothLosses:
         materials: torch.Tensor,
         fps: float,
         counted: torch.Tensor,
+        cloth: PhysicsCloth | None = None,
     ) -> None:
         self.config, self._packed, self._fps, self._counted = config, packed, fps, counted.double()
-        rest, faces = packed.rest_vertices.cpu().numpy(), packed.faces.cpu().numpy()
-        owner, sheets = packed.garment_of_face.cpu().numpy(), sheets_of(materials, packed.count)
-        self._cloth = cloth = PhysicsCloth.build(
-            rest, faces, np.array(packed.vertex_offsets), sheets, owner, packed.faces.device
-        )
+        sheets, self._of_vertex = sheets_of(materials, packed.count), packed.garment_of_vertex.long()
+        if cloth is None:
+            rest, faces = packed.rest_vertices.cpu().numpy(), packed.faces.cpu().numpy()
+            starts, owner = np.array(packed.vertex_offsets), packed.garment_of_face.cpu().numpy()
+            cloth = PhysicsCloth.build(rest, faces, starts, sheets, owner, packed.faces.device)
+        density = cloth.area.new_tensor([sheet.density for sheet in sheets])
+        self._cloth = cloth = cloth._replace(mass=cloth.area * density[self._of_vertex])
         group = torch.bucketize(cloth.hinges[:, 0].contiguous(), cloth.vertex_start[1:], right=True)
         self._bent = cloth.bend.new_zeros(packed.count).index_add_(0, group, 0.5 * BENT**2 * cloth.bend)
         stiff = 0.5 * STRAINED**2 * cloth.stiffness[:, 0, 0]
         self._strained = stiff.new_zeros(packed.count).index_add_(0, packed.garment_of_face.long(), stiff)
-        self._of_vertex = packed.garment_of_vertex.long()
         self._mass = cloth.mass.new_zeros(packed.count).index_add_(0, self._of_vertex, cloth.mass)
 
     def __call__(self, state: ClothState) -> torch.Tensor:

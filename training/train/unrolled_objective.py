@@ -96,6 +96,15 @@ class StepTaken(NamedTuple):
     solved: torch.Tensor | None  # predicted, before the physics stage; None without one
 
 
+class Seen(NamedTuple):
+    """What the network reads in a step, packed."""
+
+    features: torch.Tensor  # [F,H*34], without gradients
+    live: list[torch.Tensor]  # [F,34] each, the newest frames of these, to which gradients flow
+    velocities: torch.Tensor  # [C,(H-1)*3]
+    outside: torch.Tensor | None  # [F,K], channels of the material and the wind
+
+
 class UnrolledObjective(nn.Module):
     """Loss of a batch of unrolled samples.
 
@@ -139,7 +148,8 @@ class UnrolledObjective(nn.Module):
         fps, before, now = self.network.config.fps, batch.before, batch.vertices
         cloth = None
         if self.cloth.terms:
-            cloth = ClothLosses(self.cloth, batch.scene.packed, batch.materials, fps, batch.counted)
+            scene = batch.scene
+            cloth = ClothLosses(self.cloth, scene.packed, batch.materials, fps, batch.counted, scene.relax.cloth)
         batch.scene.features.sliding = self.unroll.sliding
         weight = batch.vertex_weight
         if self.unroll.floor:
@@ -164,9 +174,11 @@ class UnrolledObjective(nn.Module):
         scene, config = batch.scene, self.network.config
         vertices, history, features = batch.vertices, batch.history, batch.features
         before, packed = batch.before, scene.packed
+        live: list[torch.Tensor] = []  # features of the newest frames, to which gradients flow
         for k, recorded in enumerate(batch.recorded):
-            stacked = history.stacked(features)
-            newest = context(stacked.flatten(1), scene.packed.face_component, scene.packed.component_count)
+            stacked = history.stacked(features.detach())
+            live = [*live, features][-config.history :] if features.requires_grad else live
+            newest = context(features, scene.packed.face_component, scene.packed.component_count)
             target = targets(self._wanted(batch, vertices, features, recorded), newest, residual=config.residual)
             outside = packed_columns(
                 self.network.outdoor,
@@ -178,7 +190,8 @@ class UnrolledObjective(nn.Module):
                 scene.materials,
                 batch.air[k],
             )
-            output, terms = self._network(batch, stacked.flatten(1), history.velocities.flatten(1), outside, target)
+            seen = Seen(stacked.flatten(1), live, history.velocities.flatten(1), outside)
+            output, terms = self._network(batch, seen, target)
             last = k + 1 == len(batch.recorded)
             if last and not self.unroll.position and not self.cloth.terms:
                 yield StepTaken(terms, None, recorded, None)
@@ -207,37 +220,26 @@ class UnrolledObjective(nn.Module):
         velocity = scene.centroids(recorded) - scene.centroids(vertices)
         return Step(relative_deformation_gradient(phi_next, phi), singular_values(phi_next), velocity)
 
-    def _network(
-        self,
-        batch: UnrolledBatch,
-        stacked: torch.Tensor,
-        velocities: torch.Tensor,
-        outside: torch.Tensor | None,
-        target: NetworkOutput,
-    ) -> tuple[NetworkOutput, torch.Tensor]:
-        """Output of the network for packed inputs [F,H*34], [C,(H-1)*3] and [F,K], and its losses [4] against a
-        target."""
+    def _network(self, batch: UnrolledBatch, seen: Seen, target: NetworkOutput) -> tuple[NetworkOutput, torch.Tensor]:
+        """Output of the network for packed inputs, and its losses [4] against a target."""
         output = NetworkOutput(*(torch.zeros_like(part) for part in target))
-        terms = stacked.new_zeros(4)
+        terms = seen.features.new_zeros(4)
         for view in batch.scene.layout.views:
-            rows, losses = self._view(batch, view, stacked, velocities, outside, target)
+            rows, losses = self._view(batch, view, seen, target)
             view.add_to(output, rows)
             terms = terms + losses
         return output, terms
 
     def _view(
-        self,
-        batch: UnrolledBatch,
-        view: PaddedView,
-        stacked: torch.Tensor,
-        velocities: torch.Tensor,
-        outside: torch.Tensor | None,
-        target: NetworkOutput,
+        self, batch: UnrolledBatch, view: PaddedView, seen: Seen, target: NetworkOutput
     ) -> tuple[NetworkOutput, torch.Tensor]:
         """Output of the network for the rows of a view, in world space, and their share of the losses [4]."""
         garment = batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
-        rows = view.inputs(stacked, velocities, outside)._replace(
-            turn=batch.turn[garment], rest_turn=batch.joint[garment], mirrored=batch.mirrored[garment]
+        rows = view.inputs(seen.features, seen.velocities, seen.outside)._replace(
+            turn=batch.turn[garment],
+            rest_turn=batch.joint[garment],
+            mirrored=batch.mirrored[garment],
+            live=tuple(view.faces(frame) for frame in seen.live),
         )
         wanted = NetworkOutput(
             view.faces(target.psi), view.faces(target.singular_values), view.components(target.velocity)

@@ -54,6 +54,19 @@ class RowInputs(NamedTuple):
     mirrored: torch.Tensor | None = None  # bool [R], which rows are mirrored in x, after the turns
     in_network_frame: bool = False  # inputs and target are already turned and mirrored
     outdoor: torch.Tensor | None = None  # [R,N,K] channels of the material and the wind: kernels/features/outdoor.py
+    live: tuple[torch.Tensor, ...] = ()  # [R,N,K] each, the newest frames of `features` again, which has no gradient
+
+    @property
+    def newest(self) -> torch.Tensor:
+        """Features that end with those of the newest frame, with their gradient, [R,N,*]."""
+        return self.live[-1] if self.live else self.features
+
+    def whole(self) -> torch.Tensor:
+        """All features with their gradients, [R,N,H*K]."""
+        if not self.live:
+            return self.features
+        width = sum(frame.shape[-1] for frame in self.live)
+        return torch.cat([self.features[..., : self.features.shape[-1] - width], *self.live], dim=-1)
 
 
 class NormalisedOutput(NamedTuple):

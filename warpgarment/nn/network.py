@@ -289,6 +289,15 @@ class GarmentNetwork(nn.Module):
         """
         return None
 
+    def embedded_rows(self, inputs: RowInputs, turn: torch.Tensor | None) -> torch.Tensor | None:
+        """The same for rows that may be mirrored, turned with their rest pose, or have gradients in some frames alone.
+
+        Args:
+            inputs: The rows, in world space.
+            turn: As above.
+        """
+        return None
+
     def forward_embedded(
         self,
         embedded: torch.Tensor,

@@ -44,11 +44,13 @@ class PaddedView:
     share: torch.Tensor  # [R], one over the number of rows of the same garment
     real_faces: torch.Tensor | None  # int64, indices of True entries of the flattened face_mask; None if it is None
     real_components: torch.Tensor | None  # int64, indices of True entries of the flattened component_mask
-    in_order: bool  # whether the view is the packed batch itself, in one row
+    first: int | None  # first face of a view that is one row of packed faces that follow each other
 
     def faces(self, packed: torch.Tensor) -> torch.Tensor:
         """Takes values of packed faces to rows, [F,...] -> [R,N,...]."""
-        return packed[None] if self.in_order else packed[self.face_index]
+        if self.first is None:
+            return packed[self.face_index]
+        return packed[None, self.first : self.first + self.face_index.shape[1]]
 
     def components(self, packed: torch.Tensor) -> torch.Tensor:
         """Takes values of packed components to rows, [C,...] -> [R,C,...]."""
@@ -208,7 +210,7 @@ def _view(
         real_faces=_real(face_index, device),
         real_components=_real(component_index, device),
         share=torch.tensor([1.0 / min(face_splits, len(garments[g].faces)) for g, _, _ in rows], device=device),
-        in_order=packed.count == 1 and face_splits == 1,
+        first=packed.face_offsets[rows[0][0]] if len(rows) == 1 and face_splits == 1 else None,
     )
 
 

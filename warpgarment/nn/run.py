@@ -85,16 +85,23 @@ def _network(
     dtype = torch.bfloat16 if bfloat16 else torch.get_autocast_dtype(kind)
     mirrored, embedded = inputs.mirrored, None
     with torch.autocast(kind, enabled=False):  # half precision is for the network, not for positions
-        features, velocities, turn = inputs.features, inputs.velocities, _turn(network, inputs)
-        if not (noise or inputs.in_network_frame or mirrored is not None or inputs.rest_turn is not None):
-            embedded = network.embedded(features, turn, inputs.face_mask)
+        velocities, turn = inputs.velocities, _turn(network, inputs)
+        if not (noise or inputs.in_network_frame):
+            plain = mirrored is None and inputs.rest_turn is None and not inputs.live
+            if plain:
+                embedded = network.embedded(inputs.features, turn, inputs.face_mask)
+            else:
+                embedded = network.embedded_rows(inputs, turn)
+        features = inputs.whole() if embedded is None else inputs.features
         if turn is not None:
             if embedded is None:
                 features = rotate_features(features, turn, inputs.rest_turn)
             velocities = rotate_vectors(velocities, turn)
             target = None if target is None else rotate_output(target, turn)
         if mirrored is not None:
-            features, velocities = mirror_inputs(features, velocities, mirrored)
+            velocities = mirror_rows(velocities, VELOCITY, mirrored)
+            if embedded is None:
+                features = mirror_rows(features, FACE, mirrored)
             target = None if target is None else mirror_output(target, mirrored)
         x = network.encode(features) if embedded is None else embedded
         outdoor = _outdoor(network, inputs, turn)
@@ -115,7 +122,7 @@ def _turn(network: GarmentNetwork, inputs: RowInputs) -> torch.Tensor | None:
     """Rotations from the inputs' world to the network's frame, [R,3,3]; None if there is nothing to turn."""
     if inputs.in_network_frame or network.config.heading == "world":
         return None if inputs.in_network_frame else inputs.turn
-    own = canonical_frame(inputs.features, inputs.face_mask)
+    own = canonical_frame(inputs.newest, inputs.face_mask)
     return own if inputs.turn is None else inputs.turn @ own
 
 
@@ -153,7 +160,7 @@ def mirror_inputs(
 
 
 def mirror_rows(rows: torch.Tensor, layout: Layout, chosen: torch.Tensor) -> torch.Tensor:
-    """Channels of a layout [R,N,K], mirrored in x in the chosen rows, bool [R]."""
+    """Channels of a layout [R,N,K], or of several frames [R,N,H*K], mirrored in x in the chosen rows, bool [R]."""
     return rows * _signs(layout, rows, chosen)
 
 

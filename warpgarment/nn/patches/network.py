@@ -23,10 +23,11 @@ from torch import nn
 
 from warpgarment.nn.attention import ACTIVATIONS, one_by_one
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.inputs import NormalisedOutput
+from warpgarment.nn.inputs import NormalisedOutput, RowInputs
 from warpgarment.nn.network import GarmentNetwork
 
-from . import blocks, tiled
+from . import blocks, first, tiled
+from .bags import Sums, sums_of
 from .layout import PatchLayout
 
 if TYPE_CHECKING:
@@ -54,12 +55,12 @@ class FaceLayer(nn.Module):
             nn.init.zeros_(self.hear.weight)
         self.hears = hears
 
-    def forward(self, x: torch.Tensor, neighbours: torch.Tensor | None) -> torch.Tensor:
-        """Faces of all garments [F,E] -> [F,E]; `neighbours` are int64 [F,3], or None for subsets of faces."""
+    def forward(self, x: torch.Tensor, neighbours: Sums | None) -> torch.Tensor:
+        """Faces of all garments [F,E] -> [F,E]; `neighbours` is the mean over those of a face, None for subsets."""
         own = self.norm(x)
         hidden = self.expand(own)
         if self.hears:
-            around = torch.zeros_like(own) if neighbours is None else F.embedding_bag(neighbours, own, mode="mean")
+            around = torch.zeros_like(own) if neighbours is None else neighbours(own)
             hidden = hidden + self.hear(around)
         return x + self.contract(self.activation(hidden))
 
@@ -156,6 +157,10 @@ class PatchTransformer(GarmentNetwork):
             return F.linear(face_features, turned[0], bias)
         return torch.baddbmm(bias, face_features, turned.mT)
 
+    def embedded_rows(self, inputs: RowInputs, turn: torch.Tensor | None) -> torch.Tensor:
+        """The same for rows that may be mirrored: first.py."""
+        return first.embedded(self, inputs, turn)
+
     def forward_normalised(
         self,
         x: torch.Tensor,
@@ -200,18 +205,9 @@ class PatchTransformer(GarmentNetwork):
             answer, velocity = blocks.forward(self, faces.contiguous(), tokens, weights, mask)
             psi, singular_values = answer.split([9, 3], dim=-1)
             return NormalisedOutput(psi, singular_values, velocity)
-        row = torch.arange(batch, device=faces.device)[:, None, None]
-        neighbours = None if weights.neighbours is None else (weights.neighbours + count * row).flatten(0, 1)
-
-        faces = self.before(faces.flatten(0, 1), neighbours)
-        pooled = F.embedding_bag(
-            (weights.member + count * row[..., 0]).flatten(),
-            faces,
-            (weights.start + weights.member.shape[1] * row[..., 0]).flatten(),
-            mode="sum",
-            per_sample_weights=_rows(weights.member_weight, batch).flatten().to(faces.dtype),
-        )
-        pooled = pooled.unflatten(0, (batch, patches))
+        sums = sums_of(weights, batch)
+        faces = self.before(faces.flatten(0, 1), sums.around)
+        pooled = sums.pool(faces).unflatten(0, (batch, patches))
         mean = _rows(weights.pieces, batch).to(pooled.dtype) @ pooled
         tokens = torch.cat([self.to_patches(pooled), tokens + one_by_one(self.to_velocity, mean)], dim=1)
         kind = faces.device.type
@@ -223,14 +219,9 @@ class PatchTransformer(GarmentNetwork):
             tokens = layer(tokens, geodesic, mask)
         heard = self.from_patches((tokens - before)[:, :patches]).flatten(0, 1)
         tokens = self.final_norm(tokens)
-        faces = faces + F.embedding_bag(
-            (weights.patch + patches * row).flatten(0, 1),
-            heard,
-            mode="sum",
-            per_sample_weights=_rows(weights.share, batch).flatten(0, 1).to(heard.dtype),
-        )
+        faces = faces + sums.spread(heard)
         for layer in self.after:
-            faces = layer(faces, neighbours)
+            faces = layer(faces, sums.around)
         with torch.autocast(kind, enabled=False):
             precise = self.face_head.weight.dtype
             answer = self.face_head(self.face_norm(faces.to(precise))).unflatten(0, (batch, count))

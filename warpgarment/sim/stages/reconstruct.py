@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
 
+from warpgarment.kernels import kept
 from warpgarment.kernels.deformation.next_frame import next_gradients
 from warpgarment.kernels.deformation.svd import replace_singular_values
 from warpgarment.kernels.features.channels import LAYOUT
@@ -60,7 +62,8 @@ class Reconstruct:
         if pinned:
             body_of_pin = body_of_garment[packed.garment_of_pin.long()]
             self._pins = BodyPins(first_vertices[packed.pins.long()], bodies, body_of_pin)
-            responses = [mean_response(g.vertices, g.faces, g.pins, g.components[1]) for g in garments]
+            held = [(g.vertices, g.faces, g.pins, g.components[1]) for g in garments]
+            responses = [kept.of("mean response", each, partial(mean_response, *each)) for each in held]
             self._mean_response = torch.from_numpy(np.concatenate(responses)).to(packed.faces.device)[:, None]
 
     def __call__(

@@ -47,6 +47,8 @@ class Relax:
 
     Attributes:
         on: Whether the stage does anything.
+        cloth: The rest state of the batch, whose masses are areas times the mean stiffness of the membrane; None if
+            the stage does nothing.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class Relax:
         timings: Timings,
     ) -> None:
         self._packed, self._timings, self.on = packed, timings, iterations > 0
+        self.cloth: PhysicsCloth | None = None
         if not self.on:
             return
         rest, faces = packed.rest_vertices.cpu().numpy(), packed.faces.cpu().numpy()
@@ -69,6 +72,7 @@ class Relax:
             for sheet in sheets_of(materials, packed.count)
         ]
         cloth = PhysicsCloth.build(rest, faces, np.array(packed.vertex_offsets), sheets, owner, packed.faces.device)
+        self.cloth = cloth
         self._solver = ImplicitSolver(
             cloth,
             inertia=(2.0 * np.pi / length) ** 2,
