@@ -11,7 +11,8 @@ import torch
 from benchmarks.measure import Call, Row, aimed, aimed_time, compared, tensor
 from benchmarks.scenes import Dressed, dressed
 from warpgarment.kernels import deformation
-from warpgarment.kernels.features.face import body_interaction, face_features, frame_features
+from warpgarment.kernels.features.face import body_interaction, face_features
+from warpgarment.kernels.features.frame import frame_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from . import exact, manifold, solves

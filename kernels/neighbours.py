@@ -18,8 +18,11 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from . import compiling
 from .launch import as_argument, as_warp, expect, torch_stream
 from .operator import allocate
+
+wp.set_module_options(compiling.options())
 
 CELLS = 32  # along each axis; the grid repeats itself beyond, so this is a matter of speed alone
 NOBODY = -1

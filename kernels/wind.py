@@ -26,8 +26,11 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from . import compiling
 from .launch import as_warp, expect, torch_stream
 from .operator import allocate
+
+wp.set_module_options(compiling.options())
 
 AIR_DENSITY = 1.225
 """Density of air at sea level and 15 °C [kg/m^3]."""

@@ -26,11 +26,14 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, as_warp, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .pairs import FacePairs
 from .triangles import TOUCHING, corners, gap_along, nearest_points
+
+wp.set_module_options(compiling.options())
 
 UNIT = wp.constant(2.0**22)
 """Units of the sums in a metre."""

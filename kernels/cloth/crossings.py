@@ -11,10 +11,13 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, torch_stream
 
 from .contacts import Pairs, kept_pairs
 from .triangles import TOUCHING, corners, gap_along, separating
+
+wp.set_module_options(compiling.options())
 
 
 class Crossings(NamedTuple):

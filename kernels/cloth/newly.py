@@ -9,10 +9,13 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, torch_stream
 
 from .contacts import Contacts, Pairs, kept_pairs
 from .triangles import corners, separating
+
+wp.set_module_options(compiling.options())
 
 
 @wp.kernel(enable_backward=False)

@@ -17,10 +17,13 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, torch_stream
 
 from .contacts import Contacts, Pairs, kept_pairs
 from .triangles import corners
+
+wp.set_module_options(compiling.options())
 
 LEAST = wp.constant(0.3)
 ROUNDS = 6

@@ -13,8 +13,11 @@ import dataclasses
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, as_warp, expect, torch_stream
 from warpgarment.kernels.operator import allocate
+
+wp.set_module_options(compiling.options())
 
 MARGIN = 0.006
 """How much larger boxes are than the motion, on each side [m]. Pushes beyond it are cut off."""

@@ -24,11 +24,14 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, torch_stream
 
 from .contacts import Contacts, Pairs, add_push, kept_pairs, move_kernel, share_of
 from .steps import SAFE, is_safe
 from .triangles import corners, gap_along
+
+wp.set_module_options(compiling.options())
 
 ONE_MOVE = wp.constant(0.004)
 """Length [m] of a move that has the weight 1; others have one in proportion, up to `MOST`."""

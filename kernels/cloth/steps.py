@@ -25,11 +25,14 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .contacts import Contacts, Pairs, kept_pairs
 from .triangles import TOUCHING, corners, gap_along, separating
+
+wp.set_module_options(compiling.options())
 
 SAFE = wp.constant(5.0e-4)
 """Gap [m] that a pair keeps; if it has less at the start, nine tenths of what it has there beyond `TOUCHING`."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 from warpgarment.kernels.sdf.bodies import BodyMeshes
@@ -22,6 +23,8 @@ from warpgarment.kernels.sdf.nearest_face import closest_on_triangle
 
 from .contact_set import ContactFrame, Contacts
 from .way_out import leads_out, way_out
+
+wp.set_module_options(compiling.options())
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
 """Below this distance [m] the direction from the closest point is noise, and the normal of the face is used."""

@@ -22,11 +22,14 @@ import numpy as np
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.linear.triangular import substitution
 from warpgarment.kernels.operator import allocate
+
+wp.set_module_options(compiling.options())
 
 BUDGET = 2**26
 """Largest number of entries of the rows of a batch (256 MiB)."""

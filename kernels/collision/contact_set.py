@@ -29,7 +29,10 @@ from typing import NamedTuple, Protocol
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.sdf.bodies import BodyMeshes
+
+wp.set_module_options(compiling.options())
 
 
 class Contacts(NamedTuple):

@@ -24,12 +24,15 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.linear.triangular import eliminate, padded, substitute_back, substitution
 from warpgarment.kernels.operator import allocate
+
+wp.set_module_options(compiling.options())
 
 
 @wp.kernel(enable_backward=False)

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.factor import Factor
@@ -32,7 +33,9 @@ from .compliance import Compliance
 from .compliance_rows import Lines, Rows
 
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
-wp.set_module_options({"max_unroll": 1})  # unrolled loops over sixteen would compile longer and run no faster
+wp.set_module_options(
+    compiling.options(max_unroll=1)
+)  # unrolled loops over sixteen would compile longer and run no faster
 
 
 @wp.kernel(enable_backward=False)

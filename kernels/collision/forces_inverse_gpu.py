@@ -5,12 +5,15 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.system import System, block_dim, block_sum
 from warpgarment.kernels.operator import allocate
 
 from .compliance import Compliance
+
+wp.set_module_options(compiling.options())
 
 
 @wp.kernel(enable_backward=False)

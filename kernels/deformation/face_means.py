@@ -12,8 +12,11 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, as_warp, expect, launch_tiled, torch_stream
 from warpgarment.kernels.operator import allocate
+
+wp.set_module_options(compiling.options())
 
 LANES = 256
 """Threads that share a segment on a GPU."""

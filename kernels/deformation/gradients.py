@@ -22,8 +22,12 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import expect
 from warpgarment.kernels.operator import row_operator
+
+wp.set_module_options(compiling.options())
+_AT_REST = compiling.apart(f"{__name__}.rest")
 
 
 @wp.func
@@ -82,7 +86,7 @@ def face_centroids_kernel(
     centroids[i] = (vertices[face[0]] + vertices[face[1]] + vertices[face[2]]) / 3.0
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_AT_REST, enable_backward=False)
 def inverse_rest_frames_kernel(
     # In:
     rest_vertices: wp.array[wp.vec3],

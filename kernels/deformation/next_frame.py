@@ -18,10 +18,13 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .svd import svd
+
+wp.set_module_options(compiling.options())
 
 
 @wp.kernel(enable_backward=False)

@@ -12,9 +12,12 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 
 from .svd import rotation_of
+
+wp.set_module_options(compiling.options())
 
 OUTPUTS = 12  # of a face: psi by rows, sigma
 

@@ -39,8 +39,11 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate, row_operator
+
+wp.set_module_options(compiling.options())
 
 MAX_GAIN = wp.constant(wp.float64(100.0))
 """Largest factor by which the gradient of replace_singular_values may amplify one mode of its argument."""

@@ -19,11 +19,14 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .face_blocks import embed_block, first_block, head_block, hear_block, spread_block
 from .tiles import BLOCK, argument
+
+wp.set_module_options(compiling.options())
 
 LEAST = 16  # blocks that are worth another range of a launch
 SHARES, SIDES = 4, 3  # patches of a face, and its neighbours

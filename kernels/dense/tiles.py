@@ -29,7 +29,10 @@ import numpy as np
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument
+
+wp.set_module_options(compiling.options())
 
 BLOCK = 32  # rows of a block: two tiles
 STEP = 32  # columns of a tile: widths are padded to a multiple of it

@@ -19,11 +19,14 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .tiles import BLOCK, argument
 from .token_blocks import pool_block, stage_block
+
+wp.set_module_options(compiling.options())
 
 MOST_TOKENS = 1024  # for which a block has room
 MOST_COLUMNS = 512  # of queries, keys and values together

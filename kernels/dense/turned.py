@@ -10,10 +10,13 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .tiles import argument, padded, source
+
+wp.set_module_options(compiling.options())
 
 VECTOR = 16
 

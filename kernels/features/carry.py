@@ -14,10 +14,13 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, expect, launch, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .channels import FEATURES, LAYOUT
+
+wp.set_module_options(compiling.options())
 
 LIFT = wp.constant(0.005)
 """l [m], more than the depth of almost all vertices after a refinement."""

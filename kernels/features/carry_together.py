@@ -18,11 +18,14 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, expect, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .carry import DEFORMATION, DIRECTION, DISTANCE, VELOCITY, three
 from .channels import FEATURES
+
+wp.set_module_options(compiling.options())
 
 REACH = 0.2
 """R [m]."""

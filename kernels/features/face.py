@@ -1,7 +1,7 @@
 """Features of a face for the network: 34 numbers per face and frame.
 
 They are computed in two launches: the result of `body_interaction` can be stored, and `face_features` has gradients.
-`frame_features` does both in one launch, for all faces of all garments on all bodies, with exactly the same result.
+`frame.frame_features` does both in one launch, for all faces of all garments on all bodies, with the same result.
 
 Manifold-aware transformers, section 4.2; the order is that of f_i in section 4.3.
 
@@ -26,6 +26,7 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.deformation.gradients import corners_exist, expect_mesh, face_frame
 from warpgarment.kernels.deformation.svd import frame_singular_values
 from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
@@ -34,6 +35,8 @@ from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.closest import MAX_DISTANCE, Bodies, closest_on_body
 
 from .channels import FEATURES, LAYOUT
+
+wp.set_module_options(compiling.options())
 
 AT = {name: place.start for name, place in LAYOUT.items()}
 TOUCHING = wp.constant(1.0e-9)  # metres; closer points have no direction to the body
@@ -320,78 +323,3 @@ def face_features(
         interaction.deformation,
         interaction.velocity,
     )
-
-
-@wp.kernel(enable_backward=False)
-def frame_features_kernel(
-    from_row: wp.int32,
-    # Model:
-    bodies: Bodies,
-    inverse_rest: wp.array[wp.mat33],
-    faces: wp.array[wp.vec3i],
-    garment_of_face: wp.array[wp.int32],
-    body_of_face: wp.array[wp.int32],
-    # In:
-    vertices: wp.array[wp.vec3],
-    garment_mean: wp.array[wp.vec3],
-    next_vertices: wp.array[wp.vec3],
-    # Out:
-    features: wp.array2d[wp.float32],
-):
-    i = from_row + wp.tid()
-    exist, a, b, c, mean = face_and_mean(i, faces, garment_of_face, vertices, garment_mean, features)
-    if not exist:
-        return
-    closest, sign, _face, deformation, velocity = nearest_motion(
-        bodies, body_of_face[i], (a + b + c) / 3.0, next_vertices
-    )
-    write_features(features, i, a, b, c, inverse_rest[i], mean, closest, sign, deformation, velocity)
-
-
-def frame_features(
-    inverse_rest: torch.Tensor,
-    vertices: torch.Tensor,
-    faces: torch.Tensor,
-    garment_of_face: torch.Tensor,
-    garment_mean: torch.Tensor,
-    body_of_face: torch.Tensor | None,
-    bodies: BodyMeshes,
-    next_vertices: torch.Tensor,
-) -> torch.Tensor:
-    """Features of one frame, not normalised, with the interaction: in one launch and without gradients.
-
-    Args:
-        inverse_rest, vertices, faces, garment_of_face, garment_mean: Arguments of `face_features`.
-        body_of_face, bodies, next_vertices: Arguments of `body_interaction`.
-
-    Returns:
-        Features, float32 [F, 34]; columns as in `LAYOUT` (channels.py).
-    """
-    expect_mesh(vertices, faces)
-    rows, device = faces.shape[0], bodies.device
-    expect("vertices", vertices, (None, 3), device=device)
-    expect("inverse_rest", inverse_rest, (rows, 3, 3), device=device)
-    expect("garment_of_face", garment_of_face, (rows,), torch.int32, device)
-    expect("garment_mean", garment_mean, (None, 3), device=device)
-    expect("next_vertices", next_vertices, tuple(bodies.vertices.shape), device=device)
-    body_of_face = bodies.body_of("body_of_face", body_of_face, rows)
-    features = allocate((rows, FEATURES), torch.float32, device)
-    if rows:
-        with torch_stream(device) as warp_device:
-            launch_rows(
-                frame_features_kernel,
-                rows,
-                inputs=[
-                    bodies.model,
-                    as_argument(inverse_rest, wp.mat33),
-                    as_argument(faces, wp.vec3i),
-                    as_argument(garment_of_face, wp.int32),
-                    as_argument(body_of_face, wp.int32),
-                    as_argument(vertices, wp.vec3),
-                    as_argument(garment_mean, wp.vec3),
-                    as_argument(next_vertices, wp.vec3),
-                ],
-                outputs=[as_argument(features, wp.float32)],
-                device=warp_device,
-            )
-    return features

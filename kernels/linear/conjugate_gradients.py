@@ -26,10 +26,13 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .system import System, block_dim, block_sum
+
+wp.set_module_options(compiling.options())
 
 WINDOW = 8
 _WINDOW = wp.constant(WINDOW)  # as the kernels see it

@@ -41,9 +41,11 @@ import torch
 import warp as wp
 from scipy.sparse.linalg import splu
 
-from warpgarment.kernels import kept
+from warpgarment.kernels import compiling, kept
 
 from .system import System
+
+wp.set_module_options(compiling.options())
 
 BUDGET = 2**26
 """Limit of the entries in all factors of a solver together; an entry takes 8 bytes and its index 4 (768 MiB in all)."""

@@ -21,11 +21,15 @@ from collections.abc import Callable
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .factor import Factor
 from .system import System, block_dim, block_sum
+
+wp.set_module_options(compiling.options())
+_ON_GPU = compiling.apart(f"{__name__}.inverse")
 
 LANES = 32
 """Number of lanes that share a row on a GPU."""
@@ -149,7 +153,7 @@ def substitute(
                 solution[rows[begin + v]] = wp.vec3d(d[0], d[1], d[2])
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_ON_GPU, enable_backward=False)
 def multiply_lower(
     # Model:
     start: wp.array[wp.int32],
@@ -183,7 +187,7 @@ def multiply_lower(
             x[place] = pivot[k] * (s + rhs[rows[first + order[k]]])
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_ON_GPU, enable_backward=False)
 def multiply_upper(
     # Model:
     start: wp.array[wp.int32],

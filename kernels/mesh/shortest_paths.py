@@ -31,7 +31,9 @@ import warp as wp
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-wp.set_module_options({"enable_backward": False})
+from warpgarment.kernels import compiling
+
+wp.set_module_options(compiling.options(enable_backward=False))
 
 LANES = 32
 LANDMARKS = 6  # the distances to these nodes serve as coordinates of all nodes

@@ -28,10 +28,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from .. import compiling
 from .plane import SECTORS, at_ray, cross, distance_to_segment, norm, sector
 
-# Without fused operations results are those of each operation in float64, whatever the processor.
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+wp.set_module_options(compiling.options(enable_backward=False, fuse_fp=False))  # the same bits on all processors
 
 LEAST_DEPTH = 4
 DEPTH = 400

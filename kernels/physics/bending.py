@@ -27,6 +27,10 @@ import math
 
 import warp as wp
 
+from warpgarment.kernels import compiling
+
+wp.set_module_options(compiling.options())
+
 FLAT = wp.constant(wp.float64(1e-24))
 """Square of twice the area [m^4] below which a face has no normal."""
 TURN = wp.constant(wp.float64(2.0 * math.pi))

@@ -20,6 +20,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpgarment.kernels import compiling
+
+wp.set_module_options(compiling.options())
+
 
 @wp.func
 def deformation(x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, inverse_rest: wp.mat22d):

@@ -22,9 +22,12 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.cloth.contacts import Pairs, kept_pairs
 
 from .friction import friction_energy, friction_gradient
+
+wp.set_module_options(compiling.options())
 
 
 @wp.kernel(enable_backward=False)

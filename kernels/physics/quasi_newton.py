@@ -26,7 +26,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.linear.system import block_sum
+
+wp.set_module_options(compiling.options())
 
 DECREASE = wp.constant(wp.float64(1e-4))
 """Share of the decrease along the slope that a step must reach (Armijo)."""

@@ -22,7 +22,11 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpgarment.kernels import compiling
+
 from .friction import friction_energy, friction_gradient
+
+wp.set_module_options(compiling.options())
 
 
 @wp.kernel(enable_backward=False)

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.linear.system import block_sum
+
+wp.set_module_options(compiling.options())
+_ADJOINT = compiling.apart(f"{__name__}.adjoint")
 
 FREE = wp.constant(0)  # translation from `mean`
 PINNED = wp.constant(1)  # translation from the pins
@@ -90,7 +94,7 @@ def place(
         k += stride
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_ADJOINT, enable_backward=False)
 def place_adjoint(
     # Model:
     start: wp.array[wp.int32],
@@ -126,7 +130,7 @@ def place_adjoint(
         grad_mean[component] = wp.vec3(total)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_ADJOINT, enable_backward=False)
 def phi_adjoint(
     # Model:
     rest_vertices: wp.array[wp.vec3],

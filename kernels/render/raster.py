@@ -13,9 +13,9 @@ from typing import Any
 
 import warp as wp
 
-from warpgarment.kernels import launch  # noqa: F401  (quietens Warp)
+from warpgarment.kernels import compiling, launch  # noqa: F401  (launch quietens Warp)
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(compiling.options(enable_backward=False))
 
 _FAR = wp.constant(100.0)  # depth of an orthographic view [m]
 

@@ -13,9 +13,11 @@ from typing import Any
 
 import warp as wp
 
+from warpgarment.kernels import compiling
+
 from .raster import View, barycentric, closeness_of, face_of, project, rasterise, ray
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options(compiling.options(enable_backward=False))
 
 _TAPS = wp.constant(12)  # occlusion samples a pixel
 _GOLDEN = wp.constant(2.399963)  # golden angle [rad]: a spiral of taps without visible direction

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
@@ -23,6 +24,8 @@ from .nearest_face import closest_on_triangle, corners_of, named_face, nearest_o
 from .tree import Tree
 from .tree_rays import crossings_by_tree
 from .tree_search import nearest_by_tree, on_cpu
+
+wp.set_module_options(compiling.options())
 
 MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its square is still a finite float32
 # Bodies in pieces: distance, in radii, from which a group of faces is summed as one. On closed bodies 1, 2 and 3 give

@@ -28,6 +28,10 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from warpgarment.kernels import compiling
+
+wp.set_module_options(compiling.options())
+
 MOST_CAPS = 512
 """Largest number of caps of a body that are searched one by one."""
 FAR = wp.constant(1.0e30)

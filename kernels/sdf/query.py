@@ -25,6 +25,7 @@ from typing import Any
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import expect, torch_stream
 from warpgarment.kernels.operator import allocate, launch
 from warpgarment.kernels.registered import operator
@@ -32,6 +33,8 @@ from warpgarment.kernels.registered import operator
 from .bodies import BodyMeshes
 from .closest import query_bodies
 from .nearest_face import nearest_on_triangle
+
+wp.set_module_options(compiling.options())
 
 
 @wp.kernel(enable_backward=False)

@@ -32,6 +32,7 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
@@ -41,6 +42,8 @@ from .nearest_face import closest_on_triangle
 from .tree import Tree
 from .tree_boxes import boxes_in_box, triangles_above
 from .tree_search import least, least_above, stack64
+
+wp.set_module_options(compiling.options())
 
 STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""

@@ -26,10 +26,13 @@ import numpy as np
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_warp, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .tree_shape import LANES, shape_of
+
+wp.set_module_options(compiling.options())
 
 ROWS = 17
 FAR = wp.constant(1.0e18)

@@ -15,7 +15,7 @@ from warpgarment.kernels.deformation.face_means import FaceMeans
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
 from warpgarment.kernels.features.carry import carried, face_at_each_vertex
 from warpgarment.kernels.features.channels import LAYOUT
-from warpgarment.kernels.features.face import frame_features
+from warpgarment.kernels.features.frame import frame_features
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 EPSILON = 0.004

@@ -11,7 +11,7 @@ from support import meshes
 from support.poison import poison_outputs
 
 from warpgarment.kernels import deformation, features, sdf
-from warpgarment.kernels.features.face import frame_features
+from warpgarment.kernels.features.frame import frame_features
 
 GARMENTS = meshes.garments()
 

@@ -7,7 +7,8 @@ import torch
 from warpgarment.kernels.deformation.face_means import FaceMeans
 from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT
-from warpgarment.kernels.features.face import BodyInteraction, body_interaction, face_features, frame_features
+from warpgarment.kernels.features.face import BodyInteraction, body_interaction, face_features
+from warpgarment.kernels.features.frame import frame_features
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.bodies import MovingBodies
 from warpgarment.sim.timing import Timings
