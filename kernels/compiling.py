@@ -1,12 +1,15 @@
 """How Warp's kernels are compiled on a CPU: what shortens the first rollout on a machine.
 
 Warp compiles a module of kernels whole, when one of them is first launched: `apart` gives those a module of their own
-that a rollout does not launch. Each process that compiles first reads Warp's headers, once for each set of flags, so
-all modules have the same.
+that a rollout does not launch. Each thread that compiles first reads Warp's headers, once for each set of flags, so
+all modules have the same. `ahead` compiles on all cores what would be compiled one by one.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import warp as wp
@@ -41,3 +44,59 @@ def apart(name: str) -> wp.Module:
     module = wp.get_module(name)
     wp.set_module_options(options(), module)
     return module
+
+
+OF_A_FRAME = (
+    "sdf.surface_depth",
+    "features.frame",
+    "sdf.closest",
+    "collision.forces_inverse_cpu",
+    "collision.body_contacts",
+    "sdf.tree",
+    "mesh.windows",
+    "deformation.next_frame",
+    "linear.triangular",
+    "poisson.kernels",
+    "deformation.face_means",
+    "sdf.inside",
+    "deformation.gradients.rest",
+    "features.carry",
+    "collision.contact_set",
+)
+"""Modules of `warpgarment.kernels` that a rollout of a garment launches, whatever the network; slow ones first."""
+MOST_WORKERS = 4
+"""Modules that are compiled at a time, each of which takes some 100 MB; as in Warp."""
+
+making = 0
+"""Number of modules that `ahead` is compiling, and has compiled, since it was last called."""
+
+
+def ahead(names: Iterable[str]) -> None:
+    """Compiles modules for the CPU that are not in Warp's cache, several at a time, where there are several cores.
+
+    Which cores there are is a matter of the system, as for any compiler; it does not depend on `OMP_NUM_THREADS`.
+
+    Args:
+        names: Names of modules below `warpgarment.kernels`. Those that were not imported have no kernels yet, and are
+            left out.
+    """
+    global making
+    wp.init()
+    modules = [wp.get_module(f"warpgarment.kernels.{name}") for name in names]
+    missing = [module for module in modules if module.kernels and not _is_cached(module)]
+    workers = min(len(missing), _cores(), MOST_WORKERS)
+    if workers > 1:
+        making = len(missing)
+        wp.force_load("cpu", missing, max_workers=workers)
+
+
+def _is_cached(module: wp.Module) -> bool:
+    """Whether Warp has compiled a module, as it is now, before; a CPU's blocks have one thread."""
+    folder = Path(wp.config.kernel_cache_dir or "", module.get_module_identifier(1))
+    return any(folder.glob("*.o"))
+
+
+def _cores() -> int:
+    """Number of cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1

@@ -189,13 +189,19 @@ def probe(result: wp.array[wp.int32]):
 
 
 @functools.cache
-def available() -> bool:
-    """Whether this processor has the tiles, the system lets this process use them, and Warp's compiler knows them."""
+def present() -> bool:
+    """Whether this processor has the tiles, and the system lets this process use them."""
     names = "_is_amx_tile_supported", "_is_avx512_bf16_supported", "_init_amx"
     asked = [getattr(torch.cpu, name, None) for name in names]
     if platform.machine() not in ("x86_64", "AMD64") or not all(asked):
         return False
-    if not all(ask() for ask in asked if ask is not None):
+    return all(ask() for ask in asked if ask is not None)
+
+
+@functools.cache
+def available() -> bool:
+    """Whether the tiles are `present`, and Warp's compiler knows them."""
+    if not present():
         return False
     found = torch.zeros(1, dtype=torch.int32)
     wp.launch(probe, dim=1, outputs=[as_argument(found, wp.int32)], device="cpu")

@@ -2,6 +2,8 @@
 
 import importlib
 import pkgutil
+import subprocess
+import sys
 
 import pytest
 import warp as wp
@@ -42,3 +44,32 @@ def test_kernels_apart_do_not_compile_together(of, kernel, other):
     """A rollout would compile gradients, and launches of a GPU, that it never asks for."""
     file = importlib.import_module(of)
     assert getattr(file, kernel).module is not getattr(file, other).module
+
+
+AHEAD = """
+import os, sys
+import warp as wp
+wp.config.kernel_cache_dir = sys.argv[1]
+from warpgarment.kernels import compiling
+from warpgarment.kernels.collision import contact_set
+from warpgarment.kernels.features import carry
+
+compiling._cores = lambda: int(sys.argv[2])
+compiling.ahead(["collision.contact_set", "features.carry", "no.such.module"])
+print(compiling.making, sorted(os.listdir(wp.config.kernel_cache_dir)))
+"""
+
+
+def test_modules_are_compiled_ahead_once_and_at_a_time(tmp_path):
+    """Modules would be compiled one by one on many cores, or again and again. Two are made on two cores, into the
+    cache; then there is nothing left to do. On one core they are left to their first launch."""
+    said = []
+    for cores in ("1", "2", "2"):
+        command = [sys.executable, "-c", AHEAD, str(tmp_path), cores]
+        ran = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True)
+        said.append(ran.stdout.splitlines()[-1].split(maxsplit=1))
+    assert [made for made, _ in said] == ["0", "2", "0"]
+    assert said[0][1] == "[]"
+    assert "collision.contact_set_" in said[1][1]
+    assert "features.carry_" in said[1][1]
+    assert said[2][1] == said[1][1]

@@ -67,6 +67,11 @@ class GarmentNetwork(nn.Module):
     q_mean: torch.Tensor
     q_std: torch.Tensor
 
+    @property
+    def launches(self) -> tuple[str, ...]:
+        """Modules of `warpgarment.kernels` with kernels that the network launches on a CPU; for `compiling.ahead`."""
+        return ("deformation.steps",)
+
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config

@@ -15,6 +15,7 @@ from contextlib import nullcontext
 import torch
 
 from warpgarment.errors import MeshError
+from warpgarment.kernels import compiling
 from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
@@ -115,6 +116,8 @@ class Scene:
             correctors=self.correctors,
             layers=layers,
         )
+        if device.type == "cpu":
+            compiling.ahead([*compiling.OF_A_FRAME, *network.launches])
         self.brought = brought
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)

@@ -74,6 +74,11 @@ class PatchTransformer(GarmentNetwork):
 
     shares_threads = True
 
+    @property
+    def launches(self) -> tuple[str, ...]:
+        """As in `GarmentNetwork`, and the kernels of its layers on a processor that has tiles."""
+        return (*super().launches, *(tiled.LAUNCHED if tiled.suits(self) else ()))
+
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         width = config.face_embedding

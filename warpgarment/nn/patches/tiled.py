@@ -68,8 +68,17 @@ class Packed(NamedTuple):
 _known: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()
 
 
+LAUNCHED = "dense.tokens", "dense.faces", "dense.turned", "dense.tiles"
+"""Modules of `warpgarment.kernels` with the kernels of the layers, slow ones first."""
+
+
 def fits(network: PatchTransformer, count: int = 0) -> bool:
     """Whether the kernels can do this network's layers, on rows of that many tokens and on this processor."""
+    return suits(network, count) and tiles.available()
+
+
+def suits(network: PatchTransformer, count: int = 0) -> bool:
+    """Whether this processor has tiles, and the network's widths are whole numbers of them; nothing is compiled."""
     config = network.config
     widths = (config.face_embedding, config.face_feed_forward, config.embedding, config.feed_forward)
     head = config.embedding // config.heads
@@ -77,7 +86,7 @@ def fits(network: PatchTransformer, count: int = 0) -> bool:
     fit = all(width % tiles.STEP == 0 and width <= tiles.WIDEST for width in widths)
     fit = fit and head % tiles.STEP == 0 and columns <= tokens.MOST_COLUMNS and config.inputs <= MOST_INPUTS
     fit = fit and count <= tokens.MOST_TOKENS
-    return fit and config.norm_first and config.activation == "gelu" and tiles.available()
+    return fit and config.norm_first and config.activation == "gelu" and tiles.present()
 
 
 def packed(network: PatchTransformer) -> Packed:
