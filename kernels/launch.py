@@ -91,6 +91,16 @@ def descriptor(tensor: torch.Tensor, dtype: type) -> object:
     return made
 
 
+def rows_in_memory(rows: torch.Tensor) -> tuple[torch.Tensor, int]:
+    """Rows [N,K] as they are in memory, which may be part of longer rows: one dimension of numbers, and the distance of
+    two rows. Copies only rows whose own numbers are not next to each other."""
+    if rows.stride(1) != 1 or rows.stride(0) < rows.shape[1]:
+        rows = rows.contiguous()
+    count, columns = rows.shape
+    pitch = rows.stride(0) if count > 1 else columns
+    return rows.as_strided((max(count - 1, 0) * pitch + min(count, 1) * columns,), (1,)), pitch
+
+
 PER_THREAD = 3  # ranges of a launch for each thread: rows near a body take longer than others
 
 
