@@ -42,6 +42,14 @@ def expect(
         TypeError: The argument is not a tensor or has another dtype.
         ValueError: The tensor has another shape or is on another device.
     """
+    if isinstance(tensor, torch.Tensor) and tensor.dtype == dtype and (device is None or tensor.device == device):
+        lengths = tensor.shape
+        if len(lengths) == len(shape):
+            for wanted_length, length in zip(shape, lengths, strict=True):
+                if wanted_length is not None and wanted_length != length:
+                    break
+            else:
+                return
     if not isinstance(tensor, torch.Tensor):
         raise TypeError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
     if tensor.dtype != dtype:

@@ -44,4 +44,5 @@ def test_gradients_reach_the_newest_features():
     newest = torch.rand(FACES, 34, requires_grad=True)
     history = History.cold(torch.rand(FACES, 34), 1, FRAMES)
     Stacks()(history, newest).sum().backward()
-    assert newest.grad is not None and torch.equal(newest.grad, torch.ones(FACES, 34))
+    assert newest.grad is not None
+    assert torch.equal(newest.grad, torch.ones(FACES, 34))
