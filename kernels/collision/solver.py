@@ -114,7 +114,7 @@ class CollisionSolver:
         owner = torch.from_numpy(vertex_component).to(device)
         self._model = pack(Model(system, dense, factors, rows, owner, one_core))
         self._progress = Progress("CollisionSolver")
-        self._contacts: torch.Tensor | None = None
+        self._normal: torch.Tensor | None = None  # of the contacts of the last refinement
         self.vertex_count = vertex_count
         self.component_count = count
         self.device = device
@@ -144,7 +144,7 @@ class CollisionSolver:
     @property
     def contacts(self) -> int:
         """Number of contacts in the first pass of the last refinement."""
-        return 0 if self._contacts is None else int(self._contacts)
+        return 0 if self._normal is None else int(torch.count_nonzero((self._normal != 0).any(dim=1)))
 
     def refine(
         self,
@@ -236,7 +236,7 @@ class CollisionSolver:
         if isinstance(distance, torch.Tensor):  # n.(V - U) - d = n.(V - (U + d n)), so the operator's distance is zero
             anchor, distance = anchor + distance[:, None] * normal, 0.0
         if first:
-            self._contacts = torch.count_nonzero((normal != 0).any(dim=1))
+            self._normal = normal
         vertices, report, error = torch.ops.warpgarment.collision_solve(
             vertices, normal, anchor, distance, limit, self._model, self.max_iterations
         )

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch_rows, rows_in_memory, torch_stream
 
 from .svd import rotation_of
 
@@ -31,7 +31,7 @@ def entry(said: wp.array[wp.float32], scale: wp.array[wp.float32], at: wp.int32,
 def steps_kernel(
     from_row: wp.int32,
     count: wp.int32,
-    columns: wp.int32,
+    pitch: wp.int32,
     newest: wp.int32,
     residual: wp.int32,
     # Model:
@@ -57,7 +57,7 @@ def steps_kernel(
     m = wp.transpose(g) * m * g
     if residual != 0:
         d = wp.mat33d()
-        begin = face * columns + newest
+        begin = face * pitch + newest
         for k in range(9):
             d[k // 3, k % 3] = wp.float64(features[begin + k])
         m = m * wp.mat33(rotation_of(d))
@@ -96,14 +96,15 @@ def steps(
     expect("features", features, (None, None), device=said.device)
     expect("psi", out[0], (len(features), 3, 3), device=said.device)
     expect("sigma", out[1], (len(features), 3), device=said.device)
+    flat, pitch = rows_in_memory(features)
     given = [
         as_argument(scale, wp.float32),
         as_argument(index.flatten(), wp.int64),
         as_argument(turn, wp.mat33),
-        as_argument(features.flatten(), wp.float32),
+        as_argument(flat, wp.float32),
         as_argument(said.flatten(), wp.float32),
     ]
-    sizes = [count, features.shape[1], newest, int(residual)]
+    sizes = [count, pitch, newest, int(residual)]
     written = [as_argument(out[0], wp.mat33), as_argument(out[1], wp.vec3)]
     with torch_stream(said.device) as device:
         launch_rows(steps_kernel, rows * count, [*sizes, *given], written, device, least=1024)

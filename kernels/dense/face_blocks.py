@@ -33,7 +33,7 @@ PLACE = """
         const int steps = depth - k < 8 ? depth - k : 8;
         for (int i = 0; i < 32; i++)
             for (int j = 0; j < 32 * steps; j += 16) {
-                const float* f = features.data + (at + i) * columns + 32 * k + j;
+                const float* f = features.data + (at + i) * pitch + 32 * k + j;
                 const v16 x = Tiles::load(f, i < many ? columns - 32 * k - j : 0);
                 Tiles::split(x - Tiles::load(middle + 32 * k + j), hi + i * 256 + j, lo + i * 256 + j);
             }
@@ -48,6 +48,7 @@ def embed_block(
     t: int,
     count: int,
     columns: int,
+    pitch: int,
     width: int,
     packs: int,
     features: wp.array[wp.float32],

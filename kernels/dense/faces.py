@@ -20,7 +20,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import launch_rows, torch_stream
+from warpgarment.kernels.launch import launch_rows, rows_in_memory, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .face_blocks import embed_block, first_block, head_block, hear_block, spread_block
@@ -37,6 +37,7 @@ def embed_kernel(
     from_row: wp.int32,
     count: wp.int32,
     columns: wp.int32,
+    pitch: wp.int32,
     width: wp.int32,
     packs: wp.int32,
     # Model:
@@ -48,7 +49,7 @@ def embed_kernel(
     # Out:
     result: wp.array[wp.float32],
 ):
-    embed_block(from_row + wp.tid(), count, columns, width, packs, features, centre, weight, bias, result)
+    embed_block(from_row + wp.tid(), count, columns, pitch, width, packs, features, centre, weight, bias, result)
 
 
 @wp.kernel(enable_backward=False)
@@ -190,10 +191,10 @@ def embed(features: torch.Tensor, centre: torch.Tensor, weight: torch.Tensor, bi
     Returns:
         Embedded faces, shape [R,N,F].
     """
-    features = features.contiguous()
+    flat, pitch = rows_in_memory(features.flatten(0, 1))
     result = allocate((*features.shape[:2], len(bias)), features.dtype, features.device)
-    sizes = [features.shape[2], len(bias), len(weight)]
-    given = [argument(values) for values in (centre, weight, bias, features)]
+    sizes = [features.shape[2], pitch, len(bias), len(weight)]
+    given = [argument(values) for values in (centre, weight, bias, flat)]
     _launch(embed_kernel, features, [*sizes, *given], [result])
     return result
 

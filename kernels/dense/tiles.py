@@ -242,4 +242,4 @@ _TYPES = {
 
 def argument(values: torch.Tensor) -> object:
     """A tensor as the argument of a launch, in one dimension."""
-    return as_argument(values.reshape(-1), _TYPES[values.dtype])
+    return as_argument(values if values.dim() == 1 else values.reshape(-1), _TYPES[values.dtype])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 
+import numpy as np
 import torch
 
 
@@ -46,12 +47,28 @@ class Progress:
 
         Does not wait for the solve. Once the numbers have been read from the device, pass them to `warn_if_stopped`.
         """
+        if self._solves[0][0].device.type == "cpu":
+            return self._on_host()
         reports, errors = (torch.stack(tensors) for tensors in zip(*self._solves, strict=True))
         if not reports.shape[1]:
             return errors.new_zeros(3)
         stopped = reports < 0
         iterations = reports.abs().amax(1).sum()
         return torch.stack([iterations.double(), stopped.sum().double(), torch.where(stopped, errors, 0.0).max()])
+
+    def _on_host(self) -> torch.Tensor:
+        """The same where reports are on the host."""
+        iterations = stopped = 0
+        largest = 0.0
+        for report, error in self._solves:
+            counts = report.numpy()
+            if len(counts):
+                iterations += int(np.abs(counts).max())
+                ended = counts < 0
+                if ended.any():
+                    stopped += int(ended.sum())
+                    largest = max(largest, float(error.detach().numpy()[ended].max()))
+        return torch.tensor([iterations, stopped, largest], dtype=torch.float64)
 
     def warn_if_stopped(self, stopped: float, components: int, error: float) -> None:
         """Warns, once, if components were stopped by the limit.
@@ -73,6 +90,8 @@ class Progress:
         )
 
     def _warn(self, report: torch.Tensor, error: torch.Tensor) -> None:
+        if self._warned or not len(report):
+            return
         stopped = report < 0
-        if not self._warned and bool(stopped.any()):
+        if bool(stopped.any()):
             self.warn_if_stopped(int(stopped.sum()), len(report), float(error[stopped].max()))

@@ -18,7 +18,7 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     """
     before = now.positions
     features = scene.features(before, now.body, next_body)
-    stacked = now.history.stacked(features)
+    stacked = scene.stacks(now.history, features)
     step = scene.predict(scene.inputs(now, stacked, next_body))
     solved, finite = scene.reconstruct(before, step, features, next_body)
     solved = scene.relax(solved, finite)

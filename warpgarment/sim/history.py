@@ -1,7 +1,11 @@
 """The input of the network from earlier frames: features of H frames and the H-1 velocities between them (Algorithm 1).
 
 A history is never changed. Each frame makes a new one, so old states of a simulation stay usable. This is cheap: the
-only array written per frame is the stack that the network reads, and the next history is a view of it.
+only array written per frame is the stack that the network reads, and the next history is a view of it. On a CPU, stacks
+of following frames overlap in one array (`Stacks`), so that a frame writes its own features only:
+
+    stack at t    |0 1 2 3 4 5|6 . . . . . . . . .        columns of frames; dots are not written yet
+    stack at t+1    |1 2 3 4 5 6|
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ import dataclasses
 
 import torch
 
-from warpgarment.kernels.features.channels import FACE
+from warpgarment.kernels.features.channels import FACE, FEATURES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,3 +51,42 @@ class History:
             velocity: Velocity of each component from frame t to t+1 [m/frame], shape [C,3].
         """
         return History(stacked[:, 1:], torch.cat([self.velocities[:, 1:], velocity[:, None]], dim=1))
+
+
+STACKS = 2
+"""Number of stacks for which an array has room, if they did not overlap."""
+MOST_BYTES = 2**26
+"""Largest array of stacks; larger ones would take more memory than time is worth."""
+
+
+def overlapping(faces: int, frames: int) -> bool:
+    """Whether the stacks of so many faces and frames overlap on a CPU."""
+    return 4 * STACKS * frames * FEATURES * faces <= MOST_BYTES
+
+
+class Stacks:
+    """Makes the stacks of one simulation. Histories are views of them, as those of `History.stacked`."""
+
+    def __init__(self) -> None:
+        self._array: torch.Tensor | None = None  # [F,STACKS*H,34]
+        self._end = 0  # frames that are written
+
+    def __call__(self, history: History, newest: torch.Tensor) -> torch.Tensor:
+        """The same as `history.stacked(newest)`, maybe as rows [H,34] that are not next to each other in memory."""
+        past = history.features
+        frames = past.shape[1]
+        plain = past.device.type == "cpu" and not (past.requires_grad or newest.requires_grad)
+        if not plain or not overlapping(len(past), frames + 1):
+            return history.stacked(newest)
+        array, end = self._array, self._end
+        if array is None or end == array.shape[1] or not _same(past, array[:, end - frames : end]):
+            array, end = newest.new_empty((len(past), STACKS * (frames + 1), newest.shape[1])), frames
+            array[:, :frames] = past
+        array[:, end] = newest
+        self._array, self._end = array, end + 1
+        return array[:, end - frames : end + 1]
+
+
+def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
+    """Whether two tensors are the same memory."""
+    return one.data_ptr() == other.data_ptr() and one.stride() == other.stride() and one.shape == other.shape

@@ -33,6 +33,8 @@ from warpgarment.objects.sizes import Sizes
 from warpgarment.sim.stages import relax
 from warpgarment.sim.stages.correct import Corrector
 
+from .history import STACKS, overlapping
+
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
 PER_BODY_FACE, PER_BODY_VERTEX = 520, 60  # bytes of Warp's tree with winding numbers and of ours; of two positions
@@ -107,13 +109,14 @@ def predict(
         "inverting compliance": INVERTING * 8 * inverted,
     }
     peak = max(passing, key=lambda name: passing[name])
+    histories = (1 + STACKS if overlapping(faces, config.history) else 1) if cpu else GRAPHED
     return Memory(
         {
             **network,
             "compliance of collisions": blocks,
             "rows of compliance": _rows(unique) if cpu else 0,
             "factors of the solvers": _factors(unique, cpu),
-            "history of features": (1 if cpu else GRAPHED) * 4 * config.history * FEATURES * faces,
+            "history of features": histories * 4 * config.history * FEATURES * faces,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
             "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * relaxes,
             "pairs of layers": PER_MEETING_FACE * sum(len(garments[i].faces) for outfit in layers for i in outfit),

@@ -39,6 +39,7 @@ from . import memory
 from .bodies import MovingBodies
 from .brought import Brought
 from .frame import Frame
+from .history import Stacks
 from .surface import Surface
 from .timing import Timings
 
@@ -121,7 +122,7 @@ class Scene:
         self.brought = brought
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
-        self.bodies = MovingBodies(body_vertices, bodies)
+        self.bodies, self.stacks = MovingBodies(body_vertices, bodies), Stacks()
         body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
         body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
         self._refuse_far(first_vertices, body_of_vertex)

@@ -22,6 +22,7 @@ from warpgarment.kernels.features.channels import Kind, Layout
 
 if TYPE_CHECKING:
     from warpgarment.nn.attention import EncoderLayer
+    from warpgarment.nn.config import NetworkConfig
 
     from .layout import PatchLayout
     from .network import FaceLayer, PatchTransformer
@@ -39,12 +40,6 @@ class Source(NamedTuple):
     address: int
     version: int
 
-    def fresh(self) -> bool:
-        """Whether the module still has it, with the same values."""
-        value = self.value
-        same = self.place[self.name] is value and value.data_ptr() == self.address
-        return same and value._version == self.version
-
 
 class Packed(NamedTuple):
     """The weights of the layers of faces as the kernels read them."""
@@ -61,11 +56,17 @@ class Packed(NamedTuple):
     encoder: tokens.Encoder
 
     def fresh(self) -> bool:
-        """Whether no weight has changed since."""
-        return all(source.fresh() for source in self.sources)
+        """Whether no weight has changed since: the modules still have the same tensors, with the same values."""
+        for place, name, value, address, version in self.sources:
+            if place[name] is not value or value.data_ptr() != address:
+                return False
+            if not value.is_inference() and value._version != version:
+                return False
+        return True
 
 
 _known: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()
+_fitting: WeakKeyDictionary[nn.Module, tuple[NetworkConfig, bool]] = WeakKeyDictionary()
 
 
 LAUNCHED = "dense.tokens", "dense.faces", "dense.turned", "dense.tiles"
@@ -79,14 +80,21 @@ def fits(network: PatchTransformer, count: int = 0) -> bool:
 
 def suits(network: PatchTransformer, count: int = 0) -> bool:
     """Whether this processor has tiles, and the network's widths are whole numbers of them; nothing is compiled."""
-    config = network.config
+    config, fit = _fitting.get(network, (None, False))
+    if config is not network.config:
+        config, fit = network.config, _widths_fit(network.config)
+        _fitting[network] = config, fit
+    return fit and count <= tokens.MOST_TOKENS and tiles.present()
+
+
+def _widths_fit(config: NetworkConfig) -> bool:
+    """Whether the kernels have room for the layers of such a network."""
     widths = (config.face_embedding, config.face_feed_forward, config.embedding, config.feed_forward)
     head = config.embedding // config.heads
     columns = 3 * config.embedding - 2 * config.manifold_heads * head
     fit = all(width % tiles.STEP == 0 and width <= tiles.WIDEST for width in widths)
     fit = fit and head % tiles.STEP == 0 and columns <= tokens.MOST_COLUMNS and config.inputs <= MOST_INPUTS
-    fit = fit and count <= tokens.MOST_TOKENS
-    return fit and config.norm_first and config.activation == "gelu" and tiles.present()
+    return fit and config.norm_first and config.activation == "gelu"
 
 
 def packed(network: PatchTransformer) -> Packed:

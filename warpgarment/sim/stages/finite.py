@@ -21,6 +21,8 @@ def keep_finite(
     Returns:
         Positions [m], shape [V,3], and whether each garment is finite now, bool [B].
     """
+    if new.device.type == "cpu" and bool(torch.isfinite(new.detach().sum())) and bool(finite.all()):
+        return new, finite  # reading costs nothing here, and a sum with a number that is not finite is not finite
     owner = packed.garment_of_vertex.long()
     wrong = torch.zeros(packed.count, dtype=torch.int32, device=new.device)
     wrong = wrong.index_add(0, owner, (~torch.isfinite(new).all(1)).int())
