@@ -15,7 +15,7 @@ nothing where the compiler is told of no AMX, as on GPUs; `available` says wheth
 | --- | --- |
 | `Tiles::split` | sixteen numbers as hi and lo |
 | `Tiles::product` | c += a b, for 32 rows of a; b is packed by `pack` |
-| `Tiles::norm` | rows with their mean subtracted, over their standard deviation |
+| `Tiles::norm` | rows with their mean subtracted, over their standard deviation; returns one over that |
 | `Tiles::gelu` | x Phi(x) = max(x, 0) - T(|x|), T(a) = a Phi(-a) by 32 polynomials on [0, 6), error 3e-8 |
 """
 
@@ -131,7 +131,7 @@ struct Tiles {
             __builtin_ia32_tilestored64(3, c1 + 16, c_row);
         }
     }
-    static inline void norm(const float* x, int width, float* result) {
+    static inline float norm(const float* x, int width, float* result) {
         v16 sum = all(0.0f), square = all(0.0f);
         for (int j = 0; j < width; j += 16) sum += load(x + j);
         v16 mean = all(total(sum) / (float)width);
@@ -141,6 +141,7 @@ struct Tiles {
         }
         v16 scale = all(1.0f / __builtin_sqrtf(total(square) / (float)width + 1.0e-5f));
         for (int j = 0; j < width; j += 16) store(result + j, (load(x + j) - mean) * scale);
+        return scale[0];
     }
     static inline v16 fma(v16 a, v16 b, v16 c) { return __builtin_elementwise_fma(a, b, c); }
     static inline v16 exp(v16 x) {  // of numbers <= 0; error 2e-7 of the result

@@ -18,9 +18,8 @@ from warpgarment.nn.run import run
 from warpgarment.objects.garment import Garment
 
 HISTORY, LIVE = 4, 2
-OFF = (
-    1e-300  # noise so weak that it changes no number, but with which the first layer is applied to normalised features
-)
+OFF = 1e-300
+"""Noise that changes no number, but with which the first layer is applied to normalised features."""
 
 
 def layout_of(*sizes: tuple[int, int]) -> PatchLayout:
@@ -68,13 +67,9 @@ def answers(network: PatchTransformer, layout: PatchLayout, dtype: torch.dtype, 
         live=tuple(frames[HISTORY - LIVE :]) if live else (),
     )
     output = run(network, inputs, noise=noise).output
-    loss = sum(
-        (part * torch.linspace(0.5, 1.5, part.numel(), dtype=dtype).reshape(part.shape)).sum() for part in output
-    )
-    return [
-        *(part.detach() for part in output),
-        *torch.autograd.grad(loss, [*network.parameters(), *frames[HISTORY - LIVE :]]),
-    ]
+    loss = sum((part.flatten() * torch.linspace(0.5, 1.5, part.numel(), dtype=dtype)).sum() for part in output)
+    of = [*network.parameters(), *frames[HISTORY - LIVE :]]
+    return [*(part.detach() for part in output), *torch.autograd.grad(loss, of)]
 
 
 @pytest.mark.parametrize("outdoor", [(), ("density", "wind")])

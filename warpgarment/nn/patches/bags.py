@@ -20,14 +20,14 @@ from .layout import SHARES, PatchLayout
 class Bags(NamedTuple):
     """Entries of sums over the rows of an array, those of a bag after each other."""
 
-    index: torch.Tensor  # int64 [M], rows
+    entry: torch.Tensor  # int64 [M], rows
     start: torch.Tensor  # int64 [number of bags], the first entry of each
     weight: torch.Tensor  # [M]
 
     def of(self, rows: torch.Tensor) -> torch.Tensor:
         """The sums of rows [*,F], one for each bag."""
         weight = self.weight.to(rows.dtype)
-        return F.embedding_bag(self.index, rows, self.start, mode="sum", per_sample_weights=weight)
+        return F.embedding_bag(self.entry, rows, self.start, mode="sum", per_sample_weights=weight)
 
 
 class Sums:
@@ -45,10 +45,10 @@ class Sums:
     def back(self) -> Bags:
         """The transpose, found when a gradient is first asked for."""
         bags = self.forward
-        lengths = torch.diff(bags.start, append=bags.start.new_tensor([len(bags.index)]))
+        lengths = torch.diff(bags.start, append=bags.start.new_tensor([len(bags.entry)]))
         owner = torch.repeat_interleave(torch.arange(len(lengths), device=lengths.device), lengths)
-        order = torch.argsort(bags.index, stable=True)
-        many = torch.bincount(bags.index, minlength=self._rows)
+        order = torch.argsort(bags.entry, stable=True)
+        many = torch.bincount(bags.entry, minlength=self._rows)
         return Bags(owner[order], many.cumsum(0) - many, bags.weight[order])
 
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:

@@ -26,7 +26,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import NormalisedOutput, RowInputs
 from warpgarment.nn.network import GarmentNetwork
 
-from . import blocks, first, tiled
+from . import blocks, first, tiled, trained
 from .bags import Sums, sums_of
 from .layout import PatchLayout
 
@@ -57,6 +57,8 @@ class FaceLayer(nn.Module):
 
     def forward(self, x: torch.Tensor, neighbours: Sums | None) -> torch.Tensor:
         """Faces of all garments [F,E] -> [F,E]; `neighbours` is the mean over those of a face, None for subsets."""
+        if trained.fits(self, x, neighbours):
+            return trained.forward(self, x, neighbours)
         own = self.norm(x)
         hidden = self.expand(own)
         if self.hears:

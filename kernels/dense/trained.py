@@ -1,0 +1,214 @@
+"""A layer of faces on the tiles of tiles.py with its gradients, for training.
+
+With n(x) = (x - mean) / deviation over the numbers of a face, and m the mean of n over three neighbours:
+
+    y  = x + V gelu(h) + c,   h = W [n, m] + b
+    dh = gelu'(h) * V^T dy,   dW = sum dh [n, m]^T,   db = sum dh,   dV = sum dy gelu(h)^T,   dc = sum dy
+    dx = dy + n'(x)^T (the part of n in W^T dh, and a third of the part of m at each face that hears this one)
+
+The scale and shift of the layer norm belong to W and b: see `warpgarment/nn/patches/trained.py`. Sums over faces are
+those of `PART` blocks each, which are then added in their order.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from warpgarment.kernels.launch import launch_rows, torch_stream
+from warpgarment.kernels.operator import allocate
+
+from .tiles import BLOCK, argument
+from .trained_blocks import back_block, gradient_part, layer_block, norm_block
+
+LEAST = 16  # blocks that are worth another range of a launch
+PART = 12  # blocks whose gradients of weights are summed by one thread
+
+
+@wp.kernel(enable_backward=False)
+def norm_kernel(
+    from_row: wp.int32,
+    count: wp.int32,
+    width: wp.int32,
+    # In:
+    faces: wp.array[wp.float32],
+    # Out:
+    own: wp.array[wp.float32],
+    scale: wp.array[wp.float32],
+):
+    norm_block(from_row + wp.tid(), count, width, faces, own, scale)
+
+
+@wp.kernel(enable_backward=False)
+def layer_kernel(
+    from_row: wp.int32,
+    count: wp.int32,
+    width: wp.int32,
+    hidden: wp.int32,
+    hears: wp.int32,
+    # Model:
+    side: wp.array[wp.int64],
+    expand: wp.array[wp.int16],
+    expand_bias: wp.array[wp.float32],
+    contract: wp.array[wp.int16],
+    contract_bias: wp.array[wp.float32],
+    # In:
+    faces: wp.array[wp.float32],
+    own: wp.array[wp.float32],
+    # Out:
+    inner: wp.array[wp.float32],
+    result: wp.array[wp.float32],
+):
+    layer_block(
+        from_row + wp.tid(),
+        count,
+        width,
+        hidden,
+        hears,
+        side,
+        expand,
+        expand_bias,
+        contract,
+        contract_bias,
+        faces,
+        own,
+        inner,
+        result,
+    )
+
+
+@wp.kernel(enable_backward=False)
+def gradient_kernel(
+    from_row: wp.int32,
+    parts: wp.int32,
+    count: wp.int32,
+    width: wp.int32,
+    hidden: wp.int32,
+    hears: wp.int32,
+    # Model:
+    side: wp.array[wp.int64],
+    expand: wp.array[wp.int16],
+    contract: wp.array[wp.int16],
+    # In:
+    own: wp.array[wp.float32],
+    inner: wp.array[wp.float32],
+    gradient: wp.array[wp.float32],
+    # Out:
+    heard: wp.array[wp.float32],
+    sums: wp.array[wp.float32],
+):
+    gradient_part(
+        from_row + wp.tid(),
+        parts,
+        count,
+        width,
+        hidden,
+        hears,
+        side,
+        expand,
+        contract,
+        own,
+        inner,
+        gradient,
+        heard,
+        sums,
+    )
+
+
+@wp.kernel(enable_backward=False)
+def back_kernel(
+    from_row: wp.int32,
+    count: wp.int32,
+    width: wp.int32,
+    hears: wp.int32,
+    # Model:
+    start: wp.array[wp.int64],
+    owner: wp.array[wp.int64],
+    # In:
+    own: wp.array[wp.float32],
+    scale: wp.array[wp.float32],
+    heard: wp.array[wp.float32],
+    gradient: wp.array[wp.float32],
+    # Out:
+    result: wp.array[wp.float32],
+):
+    back_block(from_row + wp.tid(), count, width, hears, start, owner, own, scale, heard, gradient, result)
+
+
+class Around(NamedTuple):
+    """Who hears whom among N faces; empty arrays for a layer that hears no neighbours."""
+
+    side: torch.Tensor  # int64 [3 N], the neighbours of each face
+    start: torch.Tensor  # int64 [N], where the faces that hear a face begin in `owner`
+    owner: torch.Tensor  # int64 [3 N]
+
+
+class Weights(NamedTuple):
+    """Weights with the norm folded in; those of `tiles.pack` are int16."""
+
+    expand: torch.Tensor  # packed, of W [H,I] with I = F, or 2 F for faces that hear their neighbours
+    expand_bias: torch.Tensor  # [H]
+    contract: torch.Tensor  # packed, of V [F,H]
+    contract_bias: torch.Tensor  # [F]
+    expand_back: torch.Tensor  # packed, of W^T
+    contract_back: torch.Tensor  # packed, of V^T
+
+
+class Found(NamedTuple):
+    """What the gradient needs of the layer."""
+
+    own: torch.Tensor  # n [N,F]
+    scale: torch.Tensor  # [N], one over the deviation
+    inner: torch.Tensor  # h [N,H]
+
+
+class Gradients(NamedTuple):
+    """Gradients of what the names say, with the shapes of W, b, V and c."""
+
+    faces: torch.Tensor
+    expand: torch.Tensor
+    expand_bias: torch.Tensor
+    contract: torch.Tensor
+    contract_bias: torch.Tensor
+
+
+def layer(faces: torch.Tensor, weights: Weights, around: Around) -> tuple[torch.Tensor, Found]:
+    """The layer on faces [N,F], end to end; returns new faces [N,F], and what `gradients` needs."""
+    faces = faces.contiguous()
+    count, width = faces.shape
+    hidden, hears = len(weights.expand_bias), int(len(around.side) > 0)
+    own, result = (allocate(faces.shape, torch.float32, faces.device) for _ in range(2))
+    scale, inner = (allocate(shape, torch.float32, faces.device) for shape in ((count,), (count, hidden)))
+    read = argument(faces)
+    model = [argument(values) for values in (around.side, *weights[:4])]
+    blocks = -(-count // BLOCK)
+    with torch_stream(faces.device) as device:
+        launch_rows(norm_kernel, blocks, [count, width, read], [argument(own), argument(scale)], device, least=LEAST)
+        sizes = [count, width, hidden, hears]
+        written = [argument(inner), argument(result)]
+        launch_rows(layer_kernel, blocks, [*sizes, *model, read, argument(own)], written, device, least=LEAST)
+    return result, Found(own, scale, inner)
+
+
+def gradients(gradient: torch.Tensor, found: Found, weights: Weights, around: Around) -> Gradients:
+    """Gradients of the layer from that of its result, [N,F]."""
+    gradient = gradient.contiguous()
+    count, width = gradient.shape
+    hidden, hears = found.inner.shape[1], int(len(around.side) > 0)
+    wide, blocks = (1 + hears) * width, -(-count // BLOCK)
+    parts = -(-blocks // PART)
+    heard = allocate((count, wide), torch.float32, gradient.device)
+    lengths = [hidden * wide, hidden, width * hidden, width]
+    sums = allocate((parts, sum(lengths)), torch.float32, gradient.device)
+    result = allocate(gradient.shape, torch.float32, gradient.device)
+    own, given, read = argument(found.own), argument(gradient), argument(heard)
+    model = [argument(values) for values in (around.side, weights.expand_back, weights.contract_back)]
+    with torch_stream(gradient.device) as device:
+        inputs = [parts, count, width, hidden, hears, *model, own, argument(found.inner), given]
+        launch_rows(gradient_kernel, parts, inputs, [read, argument(sums)], device, least=1)
+        inputs = [count, width, hears, argument(around.start), argument(around.owner), own, argument(found.scale)]
+        launch_rows(back_kernel, blocks, [*inputs, read, given], [argument(result)], device, least=LEAST)
+    expand, expand_bias, contract, contract_bias = sums.sum(dim=0).split(lengths)
+    return Gradients(result, expand.view(hidden, wide), expand_bias, contract.view(width, hidden), contract_bias)
