@@ -17,11 +17,14 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
+from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .tiles import BLOCK, argument
 from .trained_blocks import back_block, gradient_part, layer_block, norm_block
+
+wp.set_module_options(compiling.options())
 
 LEAST = 16  # blocks that are worth another range of a launch
 PART = 12  # blocks whose gradients of weights are summed by one thread
