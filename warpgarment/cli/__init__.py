@@ -21,6 +21,7 @@ from warpgarment.progress import bars
 _ROOM = "warpgarment"
 NOT_FREE = 3  # exit status where a result was written that is not free of crossings
 JOBS_FAILED = 4  # exit status where some jobs of a list failed
+CLOSED = 141  # exit status where what is printed is no longer read, as shells have it for programs that a pipe ends
 _EXTRAS = {
     "newton": "physics",
     "gpytoolbox": "physics",
@@ -119,9 +120,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0; 2 where the user has to change something, which one line on stderr names; 1 for a fault of
         the program, where the line says in which file its traceback is kept; 3 where a result was written, and garments
-        that should not cross do, or were not all looked at; 4 where some jobs of a list failed.
+        that should not cross do, or were not all looked at; 4 where some jobs of a list failed; 141, without a word,
+        where nobody reads what it prints any more, as in `warpgarment train --help | head`.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        try:
+            return _run(arguments)
+        finally:
+            sys.stdout.flush()  # of help too, which ends the program; otherwise Python itself would complain at the end
+    except BrokenPipeError as error:
+        if not _nobody_reads():
+            return _own_up(error)
+        for stream in (sys.stdout, sys.stderr):  # what they still hold goes nowhere
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return CLOSED
+
+
+def _run(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage(), end="")
         return 0 if arguments else 2
@@ -140,6 +157,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = _options(verb, name, arguments[1:])
         with bars():
             status = getattr(importlib.import_module(f"{_ROOM}.{verb.module}"), verb.function)(options)
+    except BrokenPipeError:
+        raise
     except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
         return _complain(f"{type(error).__name__}: {error}")
     except ModuleNotFoundError as error:
@@ -156,6 +175,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _own_up(error)  # not one of the errors that name a remedy
         return _complain(f"{type(error).__name__}: {error}")
     return status if type(status) is int else 0
+
+
+def _nobody_reads() -> bool:
+    """Whether the output or the messages of this program go into a pipe whose other end is closed."""
+    import select
+
+    if not hasattr(select, "poll"):
+        return True  # it can be asked on POSIX alone
+    asked = select.poll()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            asked.register(stream.fileno(), 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in asked.poll(0))
 
 
 @contextlib.contextmanager
