@@ -19,9 +19,10 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows, torch_stream
+from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows, rows_in_memory, torch_stream
 from warpgarment.kernels.operator import allocate
 
+from .replaced_eight import LANES, replaced_eight_kernel
 from .svd import svd
 
 wp.set_module_options(compiling.options())
@@ -126,6 +127,19 @@ def next_gradients(
             components = as_argument(component_of_face, wp.int32)
             given = [owner, components, gradients, values, as_argument(velocity, wp.vec3)]
             launch(broken_garments_kernel, rows, [*given, marked], warp_device)
+            if replace and warp_device.is_cpu:
+                flat, pitch = rows_in_memory(features)
+                tensors = [part.contiguous().view(-1) for part in (psi, singular_values)]
+                numbers = [as_argument(part, wp.float32) for part in (flat, *tensors)]
+                launch_rows(
+                    replaced_eight_kernel,
+                    -(-rows // LANES),
+                    inputs=[rows, pitch, smallest, owner, *numbers, marked],
+                    outputs=[as_argument(target.view(-1), wp.float32)],
+                    device=warp_device,
+                    least=64,
+                )
+                return target, broken == 0
             launch_rows(
                 next_gradients_kernel,
                 rows,
