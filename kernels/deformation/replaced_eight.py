@@ -11,6 +11,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpgarment.kernels import compiling
+
+wp.set_module_options(compiling.options())
+
 LANES = 8
 
 REPLACED = """
