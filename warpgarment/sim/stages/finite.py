@@ -6,6 +6,9 @@ import torch
 
 from warpgarment.objects.pack import PackedGarments
 
+READ_ON = frozenset({"cpu"})
+"""Kinds of devices on which reading a number costs nothing."""
+
 
 def keep_finite(
     packed: PackedGarments, new: torch.Tensor, old: torch.Tensor, finite: torch.Tensor
@@ -21,8 +24,8 @@ def keep_finite(
     Returns:
         Positions [m], shape [V,3], and whether each garment is finite now, bool [B].
     """
-    if new.device.type == "cpu" and bool(torch.isfinite(new.detach().sum())) and bool(finite.all()):
-        return new, finite  # reading costs nothing here, and a sum with a number that is not finite is not finite
+    if new.device.type in READ_ON and bool(torch.isfinite(new.detach().sum())) and bool(finite.all()):
+        return new, finite  # a sum with a number that is not finite is not finite
     owner = packed.garment_of_vertex.long()
     wrong = torch.zeros(packed.count, dtype=torch.int32, device=new.device)
     wrong = wrong.index_add(0, owner, (~torch.isfinite(new).all(1)).int())
