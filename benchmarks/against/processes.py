@@ -23,7 +23,9 @@ STEPS = 6  # of a training run; the first is not timed
 
 def surroundings(threads: int) -> dict[str, str]:
     """Environment variables of a process with some threads, in which `warpgarment` is that of its interpreter."""
-    kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+    # Installed packages keep their byte code, which Python would make anew in each process where it may not be written.
+    left_out = "PYTHONPATH", "PYTHONHOME", "PYTHONDONTWRITEBYTECODE"
+    kept = {name: value for name, value in os.environ.items() if name not in left_out}
     return kept | {"OMP_NUM_THREADS": str(threads)}
 
 
