@@ -138,7 +138,10 @@ def launch_rows(
     if not device.is_cpu:
         wp.launch(kernel, dim=rows, inputs=[0, *inputs, *outputs], device=device)
         return
-    parts = min(PER_THREAD * threads.count(), rows // least) if threads.count() > 1 else 1
+    count = threads.count()
+    parts = min(PER_THREAD * count, rows // least) if count > 1 else 1
+    if parts > count:
+        parts -= parts % count  # three ranges on two threads would take as long as four
     if parts < 2:
         recorded.launch(kernel, rows, [0, *inputs, *outputs], device)
         return

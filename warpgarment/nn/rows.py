@@ -3,9 +3,9 @@
 A row of a padded view is one garment, or one of its `face_splits` interleaved subsets of faces (section 4.3). Rows of
 similar length share a view, so there is little padding, and a batch that repeats one garment shares geodesic weights.
 
-On a CPU, larger garments share a view only with copies of themselves. Padding changes the order in which attention adds
-up, hence the last bit; without it a garment in a batch moves as it does alone, bit for bit. Beyond `SMALL` faces that
-costs no time, since padded rows are not computed either.
+On a CPU, larger garments share a view only with garments of the same mesh. Padding changes the order in which
+attention adds up, hence the last bit; without it a garment in a batch moves as it does alone, bit for bit. Beyond
+`SMALL` faces that costs no time, since padded rows are not computed either.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from .inputs import RowInputs
 from .parametrisation import NetworkOutput
 
 TOKENS_PER_VIEW = 131_072  # most faces in one call of the network; bounds its activations to a few GB
+TOKENS_ON_CPU = 32_768  # the same on a CPU, where calls that are larger gain nothing
 WEIGHTS_PER_VIEW = 2**30  # most entries of geodesic weights in one call, 4 GB
 TOKENS = 6.5  # vectors per token within a layer, in float32; autocast keeps 1.5 more, of half the size
 PADDING = 1.25  # rows share a view if the longest has at most this many times the faces of the shortest
@@ -44,13 +45,14 @@ class PaddedView:
     share: torch.Tensor  # [R], one over the number of rows of the same garment
     real_faces: torch.Tensor | None  # int64, indices of True entries of the flattened face_mask; None if it is None
     real_components: torch.Tensor | None  # int64, indices of True entries of the flattened component_mask
-    first: int | None  # first face of a view that is one row of packed faces that follow each other
+    begin: int | None  # first packed face, if the rows are faces that follow each other, without padding
 
     def faces(self, packed: torch.Tensor) -> torch.Tensor:
         """Takes values of packed faces to rows, [F,...] -> [R,N,...]."""
-        if self.first is None:
+        if self.begin is None:
             return packed[self.face_index]
-        return packed[None, self.first : self.first + self.face_index.shape[1]]
+        rows, count = self.face_index.shape
+        return packed[self.begin : self.begin + rows * count].unflatten(0, (rows, count))
 
     def components(self, packed: torch.Tensor) -> torch.Tensor:
         """Takes values of packed components to rows, [C,...] -> [R,C,...]."""
@@ -140,10 +142,8 @@ def row_groups(
     for number, garment in enumerate(garments):
         faces = len(garment.faces)
         rows += [(number, s, len(range(s, faces, face_splits))) for s in range(min(face_splits, faces))]
-    occurrence: dict[int, int] = {}
-    for number, garment in enumerate(garments):
-        occurrence.setdefault(id(garment), number)
-    rows.sort(key=lambda row: (-row[2], occurrence[id(garments[row[0]])] if cpu else 0))
+    equal, most = first_equal(garments), TOKENS_ON_CPU if cpu else TOKENS_PER_VIEW
+    rows.sort(key=lambda row: (-row[2], equal[row[0]] if cpu else 0))
 
     groups: list[list[tuple[int, int, int]]] = []
     for row in rows:
@@ -151,15 +151,34 @@ def row_groups(
             longest, together = groups[-1][0][2], len(groups[-1]) + 1
             garment, first = garments[row[0]], garments[groups[-1][0][0]]
             entries = kind.entries(garment, longest, config)
-            fits = together * longest <= TOKENS_PER_VIEW and together * entries <= WEIGHTS_PER_VIEW
+            fits = together * longest <= most and together * entries <= WEIGHTS_PER_VIEW
             alike = kind.alike(garment) == kind.alike(first)
             if cpu and longest > SMALL:
-                alike = alike and garment is first and longest == row[2]
+                alike = alike and equal[row[0]] == equal[groups[-1][0][0]] and longest == row[2]
             if fits and alike and longest <= PADDING * row[2]:
                 groups[-1].append(row)
                 continue
         groups.append([row])
     return groups
+
+
+def first_equal(garments: Sequence[Garment]) -> list[int]:
+    """For each garment the first one with the same mesh, as numbers in the batch."""
+    found: list[int] = []
+    sizes: dict[tuple[int, int], list[int]] = {}
+    for number, garment in enumerate(garments):
+        others = sizes.setdefault((len(garment.faces), len(garment.vertices)), [])
+        for other in others:
+            known = garments[other]
+            if garment is known or (
+                np.array_equal(garment.faces, known.faces) and np.array_equal(garment.vertices, known.vertices)
+            ):
+                found.append(other)
+                break
+        else:
+            others.append(number)
+            found.append(number)
+    return found
 
 
 def activation_bytes(tokens: int, stack: int, stacks: tuple[float, float], width: int, hidden: int, half: bool) -> int:
@@ -196,7 +215,8 @@ def _view(
         component_index[r, : len(mine)] = mine
 
     kind = architecture(config.architecture)
-    shared = len({(id(garments[g]), first) for g, first, _ in rows}) == 1
+    equal = first_equal(garments)
+    shared = len({(equal[g], first) for g, first, _ in rows}) == 1
     shown: list[tuple[Any, np.ndarray | None]] = []
     for g, first, _ in rows[:1] if shared else rows:
         subset = None if face_splits == 1 else np.arange(first, len(garments[g].faces), face_splits)
@@ -210,8 +230,15 @@ def _view(
         real_faces=_real(face_index, device),
         real_components=_real(component_index, device),
         share=torch.tensor([1.0 / min(face_splits, len(garments[g].faces)) for g, _, _ in rows], device=device),
-        first=packed.face_offsets[rows[0][0]] if len(rows) == 1 and face_splits == 1 else None,
+        begin=_begin(face_index),
     )
+
+
+def _begin(index: np.ndarray) -> int | None:
+    """The first of indices [R,N] that follow each other; None if they do not, or some are -1."""
+    flat = index.reshape(-1)
+    follows = len(flat) > 0 and flat[0] >= 0 and np.array_equal(flat, np.arange(flat[0], flat[0] + len(flat)))
+    return int(flat[0]) if follows else None
 
 
 def _mask(index: np.ndarray, device: torch.device) -> torch.Tensor | None:
