@@ -94,8 +94,13 @@ def _inverted(block: scipy.sparse.csc_matrix, padding: int, device: torch.device
     """The inverse of a block, float32, row by row with padding at the end of each."""
     lower = torch.linalg.cholesky(torch.from_numpy(block.toarray()).to(device))
     inverse = torch.cholesky_inverse(lower)
-    symmetric = (0.5 * (inverse + inverse.T)).to(torch.float32)
-    return torch.nn.functional.pad(symmetric, (0, padding)).ravel()
+    del lower
+    if device.type != "cpu":  # LAPACK finds a triangle, which torch copies; on GPUs it is a solve
+        inverse = 0.5 * (inverse + inverse.T)
+    size = len(inverse)
+    result = torch.zeros((size, size + padding), dtype=torch.float32, device=device)
+    result[:, :size] = inverse
+    return result.ravel()
 
 
 def _pitch(size: int | np.ndarray) -> int | np.ndarray:

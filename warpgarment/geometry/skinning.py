@@ -9,6 +9,8 @@ from warpgarment.errors import MeshError
 
 from .checks import checked_positions, complain, to_numpy
 
+MOST = 250_000  # numbers of the blended transforms of a block of frames: 2 MB, which stay in the cache of a core
+
 
 def linear_blend_skinning(
     rest_vertices: np.ndarray, bone_indices: np.ndarray, bone_weights: np.ndarray, bone_transforms: np.ndarray
@@ -57,7 +59,7 @@ def linear_blend_skinning(
     rows = np.repeat(np.arange(count), indices.shape[1])
     blend = csr_matrix((weights.reshape(-1), (rows, indices.reshape(-1).astype(np.int64))), shape=(count, bones))
     posed = np.empty((frames, count, 3), dtype=np.float32)
-    block = max(1, 4_000_000 // (12 * count))
+    block = max(1, MOST // (12 * count))
     for start in range(0, frames, block):
         part = transforms[start : start + block]
         flat = part.transpose(1, 0, 2, 3).reshape(bones, -1)

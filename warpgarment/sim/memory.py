@@ -40,7 +40,7 @@ PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse m
 PER_BODY_FACE, PER_BODY_VERTEX = 520, 60  # bytes of Warp's tree with winding numbers and of ours; of two positions
 PER_MEETING_FACE = PARTNERS * (4 + 3 * 12) + 200  # bytes of pairs and their directions, and of boxes and a tree
 GRAPHED = 3  # copies of the history on a GPU: of a state, and the input and output of a graph
-INVERTING = 3  # number of float64 matrices while the compliance of a component is made
+INVERTING = 3, 2  # number of float64 matrices while the compliance of a component is made, on a GPU and on a CPU
 LANES = 16  # rows of compliance matrices are padded to a multiple of this
 POISSON_FACTOR, COLLISION_FACTOR = 36.0, 85.0  # bytes of a factor for substitution, per V log2 V of a component
 EXPLICIT_FACTOR = 80.0  # bytes of an inverted factor, per V^1.5 of a component
@@ -106,7 +106,7 @@ def predict(
         "network": network.pop("network", 0),
         "collision forces": scratch,
         "making weights": network.pop("making weights", 0),
-        "inverting compliance": INVERTING * 8 * inverted,
+        "inverting compliance": INVERTING[cpu] * 8 * inverted,
     }
     peak = max(passing, key=lambda name: passing[name])
     histories = (1 + STACKS if overlapping(faces, config.history) else 1) if cpu else GRAPHED
