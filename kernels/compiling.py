@@ -54,6 +54,7 @@ OF_A_FRAME = (
     "collision.body_contacts",
     "sdf.tree",
     "mesh.windows",
+    "deformation.replaced_eight",
     "deformation.next_frame",
     "linear.triangular",
     "poisson.kernels",
