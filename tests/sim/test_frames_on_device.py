@@ -7,8 +7,6 @@ it as well, with a CUDA graph.
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 import pytest
 import torch
@@ -43,15 +41,14 @@ def resized(number: int) -> list[Garment]:
 
 
 def test_launches_do_not_grow_with_the_batch(monkeypatch):
-    """A batch would be a loop over garments. Counted, not timed: exactly as many launches for 8 garments as for 2, and
-    for 2 as for 1 but for the one gather that lays several garments out in rows. As on a GPU, without the three small
-    layers that a CPU applies to one velocity token after another.
+    """A batch would be a loop over garments. Counted, not timed: exactly as many launches and operators for 8 garments
+    of one size as for 2 and for 1. As on a GPU, without the three small layers that a CPU applies to one velocity token
+    after another.
     """
     monkeypatch.setattr("warpgarment.nn.attention.ALIKE_ON", frozenset())
     one, two, eight = (counted_frame(resized(number)) for number in (1, 2, 8))
     assert one.launches == two.launches == eight.launches
-    assert eight.operators == two.operators
-    assert two.operators - one.operators == Counter({"index": 1})
+    assert eight.operators == two.operators == one.operators
     assert one.launches["refit"] == 1
     assert sum(one.launches.values()) > 10
 
