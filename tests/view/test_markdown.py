@@ -65,7 +65,9 @@ def test_teachers_are_written_as_published(name):
 def test_teachers_side_by_side_are_written_as_published():
     """The page that compares teachers reads otherwise than the published one of the same rows."""
     result, page = recorded("teachers")
-    written = teachers_side_by_side.markdown(result["machine"], result["rows"], result["checks"], result["frames"])
+    how = f"--frames {result['frames']} --material {result['material']}"
+    parts = (result[name] for name in ("machine", "rows", "apart", "checks"))
+    written = teachers_side_by_side.markdown(*parts, how)
     assert written == page
 
 
