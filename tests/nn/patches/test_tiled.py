@@ -102,7 +102,7 @@ def test_no_layers_after_the_patches_and_subsets_of_faces(monkeypatch):
             close(one, other, 1e-4 * max(1.0, other.abs().max().item()))
 
 
-@pytest.mark.parametrize("way", ["optimizer", "average", "loaded", "replaced", "statistics", "data"])
+@pytest.mark.parametrize("way", ["optimizer", "fused optimizer", "average", "loaded", "replaced", "statistics", "data"])
 def test_it_has_the_newest_weights(way):
     """A network in training would be validated with an earlier step's weights. Exact: a copy has nothing packed."""
     made, other = network(), network(face_layers=2)
@@ -112,10 +112,10 @@ def test_it_has_the_newest_weights(way):
     given = batch(made, GARMENTS[0])
     with torch.no_grad():
         before = made(*given[:3])
-    if way == "optimizer":
+    if way.endswith("optimizer"):
         for parameter in made.parameters():
             parameter.grad = torch.ones_like(parameter)
-        torch.optim.AdamW(made.parameters(), lr=0.01).step()
+        torch.optim.AdamW(made.parameters(), lr=0.01, fused=way.startswith("fused")).step()
     elif way == "average":
         with torch.no_grad():
             torch._foreach_lerp_(list(made.parameters()), list(other.parameters()), 0.5)

@@ -54,13 +54,19 @@ def test_gradients_are_those_of_the_layer(hears, faces, width, hidden):
         assert (one - other).norm() <= 3e-5 * other.norm(), name
 
 
-def test_weights_that_change_are_packed_anew():
-    """After a step of the optimiser the layer still has its old weights."""
+@pytest.mark.parametrize("fused", [None, False, True])
+def test_weights_that_change_are_packed_anew(fused):
+    """After a step of the optimiser the layer still has its old weights; a fused one does not count its changes."""
     layer, sums = layer_of(32, 32, True), neighbours(50)
     before = answers(layer, 50, sums, torch.float32)
-    with torch.no_grad():
+    if fused is None:
+        with torch.no_grad():
+            for parameter in layer.parameters():
+                parameter.mul_(1.5)
+    else:
         for parameter in layer.parameters():
-            parameter.mul_(1.5)
+            parameter.grad = torch.ones_like(parameter)
+        torch.optim.AdamW(layer.parameters(), lr=0.1, fused=fused).step()
     after = answers(layer, 50, sums, torch.float32)
     expected = answers(copy.deepcopy(layer).double(), 50, sums, torch.float64)
     assert not torch.allclose(before[0], after[0])

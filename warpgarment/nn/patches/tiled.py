@@ -20,6 +20,8 @@ from warpgarment.kernels.dense import tiles, tokens
 from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
 from warpgarment.kernels.features.channels import Kind, Layout
 
+from . import changes
+
 if TYPE_CHECKING:
     from warpgarment.nn.attention import EncoderLayer
     from warpgarment.nn.config import NetworkConfig
@@ -45,6 +47,7 @@ class Packed(NamedTuple):
     """The weights of the layers of faces as the kernels read them."""
 
     sources: list[Source]  # the parameters and statistics they were made from
+    steps: int  # of optimisers until then
     embed: torch.Tensor  # [F,H,K], over the deviations of the features
     first_factor: torch.Tensor  # of each entry of the matrix that turns features, from `factors`
     second_factor: torch.Tensor
@@ -57,10 +60,10 @@ class Packed(NamedTuple):
 
     def fresh(self) -> bool:
         """Whether no weight has changed since: the modules still have the same tensors, with the same values."""
+        if self.steps != changes.optimiser_steps():
+            return False
         for place, name, value, address, version in self.sources:
-            if place[name] is not value or value.data_ptr() != address:
-                return False
-            if not value.is_inference() and value._version != version:
+            if place[name] is not value or value.data_ptr() != address or changes.version(value) != version:
                 return False
         return True
 
@@ -114,7 +117,7 @@ def _sources(network: PatchTransformer) -> list[Source]:
     for place, name in [*places, (network._buffers, "feature_std")]:
         value = place[name]
         if value is not None:
-            found.append(Source(place, name, value, value.data_ptr(), 0 if value.is_inference() else value._version))
+            found.append(Source(place, name, value, value.data_ptr(), changes.version(value)))
     return found
 
 
@@ -125,6 +128,7 @@ def _pack(network: PatchTransformer) -> Packed:
     head, head_bias = folded(network.face_norm, network.face_head.weight, network.face_head.bias)
     return Packed(
         _sources(network),
+        changes.optimiser_steps(),
         (weight / network.feature_std).contiguous(),
         *factors(network.channels),
         torch.tensor([1.0, 0.0]),

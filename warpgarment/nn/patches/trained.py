@@ -16,13 +16,14 @@ from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import tiles, trained
 
+from . import changes
 from .tiled import as_tiles
 
 if TYPE_CHECKING:
     from .bags import Sums
     from .network import FaceLayer
 
-Key = tuple[tuple[int, int], ...]
+Key = tuple[int, tuple[tuple[int, int], ...]]
 _packed: WeakKeyDictionary[nn.Module, tuple[Key, trained.Weights]] = WeakKeyDictionary()
 
 
@@ -49,7 +50,8 @@ def forward(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> torch
 
 def weights_of(layer: FaceLayer) -> trained.Weights:
     """The packed weights of a layer, made anew when one has changed."""
-    key = tuple((parameter.data_ptr(), parameter._version) for parameter in layer.parameters())
+    versions = [(parameter.data_ptr(), changes.version(parameter)) for parameter in layer.parameters()]
+    key = changes.optimiser_steps(), tuple(versions)
     known = _packed.get(layer)
     if known is None or known[0] != key:
         known = key, _pack(layer)
