@@ -68,11 +68,8 @@ OF_A_FRAME = (
 MOST_WORKERS = 4
 """Modules that are compiled at a time, each of which takes some 100 MB; as in Warp."""
 
-making = 0
-"""Number of modules that `ahead` is compiling, and has compiled, since it was last called."""
 
-
-def ahead(names: Iterable[str]) -> None:
+def ahead(names: Iterable[str]) -> int:
     """Compiles modules for the CPU that are not in Warp's cache, several at a time, where there are several cores.
 
     Which cores there are is a matter of the system, as for any compiler; it does not depend on `OMP_NUM_THREADS`.
@@ -80,15 +77,18 @@ def ahead(names: Iterable[str]) -> None:
     Args:
         names: Names of modules below `warpgarment.kernels`. Those that were not imported have no kernels yet, and are
             left out.
+
+    Returns:
+        The number of modules that were compiled.
     """
-    global making
     wp.init()
     modules = [wp.get_module(f"warpgarment.kernels.{name}") for name in names]
     missing = [module for module in modules if module.kernels and not _is_cached(module)]
     workers = min(len(missing), _cores(), MOST_WORKERS)
-    if workers > 1:
-        making = len(missing)
-        wp.force_load("cpu", missing, max_workers=workers)
+    if workers < 2:
+        return 0
+    wp.force_load("cpu", missing, max_workers=workers)
+    return len(missing)
 
 
 def _is_cached(module: wp.Module) -> bool:

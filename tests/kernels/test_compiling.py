@@ -55,8 +55,8 @@ from warpgarment.kernels.collision import contact_set
 from warpgarment.kernels.features import carry
 
 compiling._cores = lambda: int(sys.argv[2])
-compiling.ahead(["collision.contact_set", "features.carry", "no.such.module"])
-print(compiling.making, sorted(os.listdir(wp.config.kernel_cache_dir)))
+made = compiling.ahead(["collision.contact_set", "features.carry", "no.such.module"])
+print(made, sorted(os.listdir(wp.config.kernel_cache_dir)))
 """
 
 

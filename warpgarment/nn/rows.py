@@ -116,7 +116,8 @@ def padded_views(
     if not architecture(config.architecture).subsets:
         face_splits = 1
     groups = row_groups(garments, config, face_splits, cpu=packed.faces.device.type == "cpu")
-    return [_view(packed, garments, config, face_splits, group) for group in groups]
+    equal = first_equal(garments)
+    return [_view(packed, garments, equal, config, face_splits, group) for group in groups]
 
 
 def row_groups(
@@ -164,21 +165,9 @@ def row_groups(
 
 def first_equal(garments: Sequence[Garment]) -> list[int]:
     """For each garment the first one with the same mesh, as numbers in the batch."""
-    found: list[int] = []
-    sizes: dict[tuple[int, int], list[int]] = {}
-    for number, garment in enumerate(garments):
-        others = sizes.setdefault((len(garment.faces), len(garment.vertices)), [])
-        for other in others:
-            known = garments[other]
-            if garment is known or (
-                np.array_equal(garment.faces, known.faces) and np.array_equal(garment.vertices, known.vertices)
-            ):
-                found.append(other)
-                break
-        else:
-            others.append(number)
-            found.append(number)
-    return found
+    first: dict[tuple[bytes, bytes], int] = {}
+    meshes = ((garment.faces.tobytes(), garment.vertices.tobytes()) for garment in garments)
+    return [first.setdefault(mesh, number) for number, mesh in enumerate(meshes)]
 
 
 def activation_bytes(tokens: int, stack: int, stacks: tuple[float, float], width: int, hidden: int, half: bool) -> int:
@@ -200,6 +189,7 @@ def activation_bytes(tokens: int, stack: int, stacks: tuple[float, float], width
 def _view(
     packed: PackedGarments,
     garments: Sequence[Garment],
+    equal: Sequence[int],
     config: NetworkConfig,
     face_splits: int,
     rows: Sequence[tuple[int, int, int]],
@@ -215,7 +205,6 @@ def _view(
         component_index[r, : len(mine)] = mine
 
     kind = architecture(config.architecture)
-    equal = first_equal(garments)
     shared = len({(equal[g], first) for g, first, _ in rows}) == 1
     shown: list[tuple[Any, np.ndarray | None]] = []
     for g, first, _ in rows[:1] if shared else rows:
