@@ -1,4 +1,4 @@
-"""Layers of faces on the tiles of tiles.py: one launch for each layer, with everything between two products in it.
+"""Layers of faces with the products of products.py: one launch for each layer, all between two products in it.
 
 A thread works on a block of 32 faces of a row. With n(x) = (x - mean) / deviation, over the numbers of a face:
 
@@ -24,7 +24,7 @@ from warpgarment.kernels.launch import launch_rows, rows_in_memory, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .face_blocks import embed_block, first_block, head_block, hear_block, spread_block
-from .tiles import BLOCK, argument
+from .products import BLOCK, argument
 
 wp.set_module_options(compiling.options())
 
@@ -42,7 +42,7 @@ def embed_kernel(
     packs: wp.int32,
     # Model:
     centre: wp.array[wp.float32],
-    weight: wp.array[wp.int16],
+    weight: wp.array[wp.float32],
     bias: wp.array[wp.float32],
     # In:
     features: wp.array[wp.float32],
@@ -59,9 +59,9 @@ def first_kernel(
     width: wp.int32,
     hidden: wp.int32,
     # Model:
-    expand: wp.array[wp.int16],
+    expand: wp.array[wp.float32],
     expand_bias: wp.array[wp.float32],
-    contract: wp.array[wp.int16],
+    contract: wp.array[wp.float32],
     contract_bias: wp.array[wp.float32],
     # In and out:
     faces: wp.array[wp.float32],
@@ -100,11 +100,11 @@ def hear_kernel(
     outputs: wp.int32,
     # Model:
     side: wp.array[wp.int64],
-    expand: wp.array[wp.int16],
+    expand: wp.array[wp.float32],
     expand_bias: wp.array[wp.float32],
-    contract: wp.array[wp.int16],
+    contract: wp.array[wp.float32],
     contract_bias: wp.array[wp.float32],
-    head: wp.array[wp.int16],
+    head: wp.array[wp.float32],
     head_bias: wp.array[wp.float32],
     # In:
     own: wp.array[wp.float32],
@@ -141,7 +141,7 @@ def head_kernel(
     width: wp.int32,
     outputs: wp.int32,
     # Model:
-    weight: wp.array[wp.int16],
+    weight: wp.array[wp.float32],
     bias: wp.array[wp.float32],
     # In:
     own: wp.array[wp.float32],
@@ -154,9 +154,9 @@ def head_kernel(
 class Perceptron(NamedTuple):
     """The weights of a layer, packed, with the norm before it folded in."""
 
-    expand: torch.Tensor  # int16, of [H,F] or, for faces that hear their neighbours, [H,2F]
+    expand: torch.Tensor  # packed, of [H,F] or, for faces that hear their neighbours, [H,2F]
     expand_bias: torch.Tensor  # [H]
-    contract: torch.Tensor  # int16, of [F,H]
+    contract: torch.Tensor  # packed, of [F,H]
     contract_bias: torch.Tensor  # [F]
 
     @property
@@ -185,7 +185,7 @@ def embed(features: torch.Tensor, centre: torch.Tensor, weight: torch.Tensor, bi
     Args:
         features: Features of all frames, shape [R,N,I].
         centre: What is subtracted from them, from `turned.turned`, shape [R,I'] or [1,I'].
-        weight: Packed weights of the same rows, int16.
+        weight: Packed weights of the same rows.
         bias: Biases, shape [F].
 
     Returns:
@@ -226,7 +226,7 @@ def spread(faces: torch.Tensor, patch: torch.Tensor, share: torch.Tensor, heard:
 class Head(NamedTuple):
     """The last layer."""
 
-    weight: torch.Tensor  # int16, packed, of [O,F]
+    weight: torch.Tensor  # packed, of [O,F]
     bias: torch.Tensor  # [O]
 
 

@@ -1,4 +1,4 @@
-"""What a thread of tokens.py does with its block of 32 tokens, as functions in C++ on the tiles of tiles.py.
+"""What a thread of tokens.py does with its block of 32 tokens, as functions in C++ on the products of products.py.
 
 Each stage reads keys and values of all blocks and writes those of its own block for the next stage, so there are two
 rooms for them. T, P, C, E and F are those of tokens.py; L are the learned columns, H the hidden width, D the width of a
@@ -8,14 +8,14 @@ head.
 | --- | --- | --- |
 | x, start | T' E each | T' is T padded to blocks |
 | y | T' F | |
-| q, k, v, twice | T' learned, T' learned, T' E | k and v packed as the right side of a product, hi and lo |
+| q, k, v, twice | T' learned, T' learned, T' E | k and v packed as the right side of a product, |
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from .tiles import source
+from .products import source
 
 SIZES = """
     const int T = sizes.data[0], P = sizes.data[1], E = sizes.data[2], F = sizes.data[3], L = sizes.data[4];
@@ -27,7 +27,7 @@ POOL = source(
     SIZES
     + """
     alignas(64) float c[32 * 256];
-    alignas(64) __bf16 hi[32 * 256], lo[32 * 256];
+    LEFT(left, 32 * 256);
     const int parts = (P + 31) / 32, row = t / parts, from = 32 * (t % parts), many = P - from < 32 ? P - from : 32;
     const long stride = (long)Tp * (2 * E + F) + 2l * Tp * Q, to = row % layouts;
     float* x = room.data + row * stride;
@@ -40,17 +40,17 @@ POOL = source(
             const long end = from + i + 1 < P ? begin[1] : (long)members;
             for (long m = begin[0]; m < end; m++) {
                 const float* face = all + member.data[to * members + m] * F;
-                v16 w = Tiles::all(weight.data[to * members + m]);
-                for (int j = 0; j < F / 16; j++) sum[j] = Tiles::fma(w, Tiles::load(face + 16 * j), sum[j]);
+                v16 w = Vector::all(weight.data[to * members + m]);
+                for (int j = 0; j < F / 16; j++) sum[j] = Vector::fma(w, Vector::load(face + 16 * j), sum[j]);
             }
-            for (int j = 0; j < F / 16; j++) Tiles::store(y + (from + i) * F + 16 * j, sum[j]);
+            for (int j = 0; j < F / 16; j++) Vector::store(y + (from + i) * F + 16 * j, sum[j]);
         }
-        for (int j = 0; j < F / 16; j++) Tiles::split(sum[j], hi + i * F + 16 * j, lo + i * F + 16 * j);
-        for (int j = 0; j < E; j += 16) Tiles::store(c + i * E + j, Tiles::load(bias.data + j));
+        for (int j = 0; j < F / 16; j++) left.put(i * F + 16 * j, sum[j]);
+        for (int j = 0; j < E; j += 16) Vector::store(c + i * E + j, Vector::load(bias.data + j));
     }
-    Tiles::begin();
-    Tiles::product(hi, lo, F, (const __bf16*)packed.data, 0, F / 32, F / 32, E, c, E);
-    Tiles::end();
+    Matrix::begin();
+    Matrix::product(left, F, packed.data, 0, F / 32, F / 32, E, c, E);
+    Matrix::end();
     __builtin_memcpy(x + from * E, c, 4l * many * E);
     __builtin_memcpy(x + (Tp + from) * E, c, 4l * many * E);
 """
@@ -66,7 +66,7 @@ def pool_block(
     start: wp.array[wp.int64],
     member: wp.array[wp.int64],
     weight: wp.array[wp.float32],
-    packed: wp.array[wp.int16],
+    packed: wp.array[wp.float32],
     bias: wp.array[wp.float32],
     faces: wp.array[wp.float32],
     room: wp.array[wp.float32],
@@ -75,110 +75,100 @@ def pool_block(
 
 LAYER = """
     if (stage > 0) {  // attention
-        const __bf16* w = (const __bf16*)weights.data + (stage - 1) * layer_weights;
+        const float* w = weights.data + (stage - 1) * layer_weights;
         const float* b = biases.data + (stage - 1) * layer_biases;
         const float* q = keys_of(stage - 1);
-        const __bf16* k = (const __bf16*)(q + (long)Tp * L);
-        const __bf16* v = (const __bf16*)(q + 2l * Tp * L);
+        const float* k = q + (long)Tp * L;
+        const float* v = q + 2l * Tp * L;
         for (int j = 0; j < Tp; j++) open[j] = j < T && (!masks || mask.data[(long)row * T + j]) ? 1.0f : 0.0f;
-        for (int i = 0; i < 32 * E; i += 16) Tiles::store(c + i, v16{});
+        for (int i = 0; i < 32 * E; i += 16) Vector::store(c + i, v16{});
         for (int h = 0; h < L / D; h++) {
             for (int i = 0; i < 32; i++) {
                 for (int j = 0; j < D; j += 16)
-                    Tiles::split(Tiles::load(q + (long)(from + i) * L + h * D + j), hi + i * D + j, lo + i * D + j);
-                for (int j = 0; j < Tp; j += 16) Tiles::store(s + i * Tp + j, v16{});
+                    left.put(i * D + j, Vector::load(q + (long)(from + i) * L + h * D + j));
+                for (int j = 0; j < Tp; j += 16) Vector::store(s + i * Tp + j, v16{});
             }
-            Tiles::product(hi, lo, D, k + 2l * h * Tp * D, 0, D / 32, D / 32, Tp, s, Tp);
+            Matrix::product(left, D, k + (long)h * Tp * D, 0, D / 32, D / 32, Tp, s, Tp);
             for (int i = 0; i < 32; i++) {
-                v16 most = Tiles::all(-1e30f), sum = {};
+                v16 most = Vector::all(-1e30f), sum = {};
                 for (int j = 0; j < Tp; j += 16)
-                    most = __builtin_elementwise_max(most, Tiles::load(open + j) > 0.0f ? Tiles::load(s + i * Tp + j)
-                                                                                        : Tiles::all(-1e30f));
+                    most = __builtin_elementwise_max(most, Vector::load(open + j) > 0.0f ? Vector::load(s + i * Tp + j)
+                                                                                        : Vector::all(-1e30f));
                 float highest = most[0];
                 for (int j = 1; j < 16; j++) highest = most[j] > highest ? most[j] : highest;
                 for (int j = 0; j < Tp; j += 16) {
-                    v16 p = Tiles::exp(Tiles::load(s + i * Tp + j) - Tiles::all(highest));
-                    p = Tiles::load(open + j) > 0.0f ? p : v16{};
+                    v16 p = Vector::exp(Vector::load(s + i * Tp + j) - Vector::all(highest));
+                    p = Vector::load(open + j) > 0.0f ? p : v16{};
                     sum += p;
-                    Tiles::split(p, hi + i * Tp + j, lo + i * Tp + j);
+                    left.put(i * Tp + j, p);
                 }
-                scale[i] = 1.0f / Tiles::total(sum);
+                scale[i] = 1.0f / Vector::total(sum);
             }
-            Tiles::product(hi, lo, Tp, v + 2l * h * D * Tp, 0, blocks, blocks, D, c + h * D, E);
+            Matrix::product(left, Tp, v + (long)h * D * Tp, 0, blocks, blocks, D, c + h * D, E);
             for (int i = 0; i < 32; i++)
                 for (int j = h * D; j < h * D + D; j += 16)
-                    Tiles::store(c + i * E + j, Tiles::load(c + i * E + j) * Tiles::all(scale[i]));
+                    Vector::store(c + i * E + j, Vector::load(c + i * E + j) * Vector::all(scale[i]));
         }
         if (L < E) {
             const float* g = geodesic.data + (long)(row % layouts) * P * P;
             for (int i = 0; i < 32; i++)
                 for (int j = 0; j < Tp; j += 16) {
                     const int r = from + i;
-                    v16 a = Tiles::load(g + (long)r * P + j, r < P ? P - j : 0);
+                    v16 a = Vector::load(g + (long)r * P + j, r < P ? P - j : 0);
                     if (r >= P && r < T && j <= r && r < j + 16) a[r - j] = 1.0f;
-                    Tiles::split(a, hi + i * Tp + j, lo + i * Tp + j);
+                    left.put(i * Tp + j, a);
                 }
-            Tiles::product(hi, lo, Tp, v + 2l * L * Tp, 0, blocks, blocks, E - L, c + L, E);
+            Matrix::product(left, Tp, v + (long)L * Tp, 0, blocks, blocks, E - L, c + L, E);
         }
         for (int i = 0; i < 32; i++)
             for (int j = 0; j < E; j += 16) {
-                Tiles::split(Tiles::load(c + i * E + j), hi + i * E + j, lo + i * E + j);
-                Tiles::store(x + i * E + j, Tiles::load(x + i * E + j) + Tiles::load(b + Q + j));
+                left.put(i * E + j, Vector::load(c + i * E + j));
+                Vector::store(x + i * E + j, Vector::load(x + i * E + j) + Vector::load(b + Q + j));
             }
-        Tiles::product(hi, lo, E, w + 2l * E * Q, 0, E / 32, E / 32, E, x, E);
+        Matrix::product(left, E, w + (long)E * Q, 0, E / 32, E / 32, E, x, E);
         for (int i = 0; i < 32; i++) {  // feed-forward
-            Tiles::norm(x + i * E, E, c);
+            Vector::norm(x + i * E, E, c);
             for (int j = 0; j < E; j += 16) {
-                Tiles::split(Tiles::load(c + j), hi + i * E + j, lo + i * E + j);
-                Tiles::store(x + i * E + j, Tiles::load(x + i * E + j) + Tiles::load(b + Q + E + H + j));
+                left.put(i * E + j, Vector::load(c + j));
+                Vector::store(x + i * E + j, Vector::load(x + i * E + j) + Vector::load(b + Q + E + H + j));
             }
-            for (int j = 0; j < H; j += 16) Tiles::store(s + i * H + j, Tiles::load(b + Q + E + j));
+            for (int j = 0; j < H; j += 16) Vector::store(s + i * H + j, Vector::load(b + Q + E + j));
         }
-        Tiles::product(hi, lo, E, w + 2l * E * (Q + E), 0, E / 32, E / 32, H, s, H);
-        for (int i = 0; i < 32 * H; i += 16) Tiles::split(Tiles::gelu(Tiles::load(s + i)), hi + i, lo + i);
-        Tiles::product(hi, lo, H, w + 2l * E * (Q + E + H), 0, H / 32, H / 32, E, x, E);
+        Matrix::product(left, E, w + (long)E * (Q + E), 0, E / 32, E / 32, H, s, H);
+        for (int i = 0; i < 32 * H; i += 16) left.put(i, Vector::gelu(Vector::load(s + i)));
+        Matrix::product(left, H, w + (long)E * (Q + E + H), 0, H / 32, H / 32, E, x, E);
     }
 """
 
 KEYS = """
     if (stage < layers) {
-        const __bf16* w = (const __bf16*)weights.data + stage * layer_weights;
+        const float* w = weights.data + stage * layer_weights;
         const float* b = biases.data + stage * layer_biases;
         float* q = (float*)keys_of(stage);
-        __bf16* k = (__bf16*)(q + (long)Tp * L);
-        __bf16* v = (__bf16*)(q + 2l * Tp * L);
+        float* k = q + (long)Tp * L;
+        float* v = q + 2l * Tp * L;
         for (int i = 0; i < 32; i++) {
-            Tiles::norm(x + i * E, E, c);
-            for (int j = 0; j < E; j += 16) Tiles::split(Tiles::load(c + j), hi + i * E + j, lo + i * E + j);
-            for (int j = 0; j < Q; j += 16) Tiles::store(s + i * Q + j, Tiles::load(b + j));
+            Vector::norm(x + i * E, E, c);
+            for (int j = 0; j < E; j += 16) left.put(i * E + j, Vector::load(c + j));
+            for (int j = 0; j < Q; j += 16) Vector::store(s + i * Q + j, Vector::load(b + j));
         }
-        Tiles::product(hi, lo, E, w, 0, E / 32, E / 32, Q, s, Q);
+        Matrix::product(left, E, w, 0, E / 32, E / 32, Q, s, Q);
         for (int i = 0; i < 32; i++) {
             if (i >= many)
-                for (int j = 0; j < Q; j += 16) Tiles::store(s + i * Q + j, v16{});
+                for (int j = 0; j < Q; j += 16) Vector::store(s + i * Q + j, v16{});
             __builtin_memcpy(q + (long)(from + i) * L, s + i * Q, 4l * L);
             for (int j = 0; j < L; j += 32) {  // 32 numbers of a key are a column of a tile
-                alignas(64) __bf16 both[2][32];
-                for (int half = 0; half < 32; half += 16)
-                    Tiles::split(Tiles::load(s + i * Q + L + j + half), both[0] + half, both[1] + half);
                 const int h = j / D, step = (j % D) / 32, tile = (from + i) / 16;
-                int* to = (int*)(k + 2l * h * Tp * D + ((long)tile * (D / 32) + step) * 1024);
-                for (int part = 0; part < 2; part++)
-                    for (int pair = 0; pair < 16; pair++)
-                        to[256 * part + 16 * pair + i % 16] = ((int*)both[part])[pair];
+                const float* key = s + i * Q + L + j;
+                Matrix::column(k + (long)h * Tp * D + ((long)tile * (D / 32) + step) * 512, i % 16, Vector::load(key),
+                               Vector::load(key + 16));
             }
         }
-        typedef __bf16 h32 __attribute__((vector_size(64), aligned(2)));
-        for (int i = 0; i < 32; i += 2)  // two values are a row of a tile
+        for (int i = 0; i < 32; i += 2)
             for (int j = 0; j < E; j += 16) {
-                alignas(64) __bf16 both[2][2][16];
-                for (int n = 0; n < 2; n++)
-                    Tiles::split(Tiles::load(s + (i + n) * Q + 2 * L + j), both[0][n], both[1][n]);
-                __bf16* to = v + ((long)(j / 16) * blocks + from / 32) * 1024 + 16 * i;
-                for (int part = 0; part < 2; part++)
-                    *(h32*)(to + 512 * part) = __builtin_shufflevector(
-                        *(h16*)both[part][0], *(h16*)both[part][1], 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7,
-                        23, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+                const float* value = s + i * Q + 2 * L + j;
+                Matrix::rows(v + ((long)(j / 16) * blocks + from / 32) * 512, i, Vector::load(value),
+                             Vector::load(value + Q));
             }
     }
 """
@@ -189,22 +179,22 @@ LAST = """
         const float* at_start = x + (long)Tp * E;
         for (int i = 0; i < 32; i++) {
             for (int j = 0; j < E; j += 16) {
-                v16 change = Tiles::load(x + i * E + j) - Tiles::load(at_start + i * E + j);
-                Tiles::split(change, hi + i * E + j, lo + i * E + j);
+                v16 change = Vector::load(x + i * E + j) - Vector::load(at_start + i * E + j);
+                left.put(i * E + j, change);
             }
-            for (int j = 0; j < F; j += 16) Tiles::store(s + i * F + j, Tiles::load(b + j));
+            for (int j = 0; j < F; j += 16) Vector::store(s + i * F + j, Vector::load(b + j));
         }
-        const __bf16* w = (const __bf16*)weights.data + layers * layer_weights;
-        Tiles::product(hi, lo, E, w, 0, E / 32, E / 32, F, s, F);
+        const float* w = weights.data + layers * layer_weights;
+        Matrix::product(left, E, w, 0, E / 32, E / 32, F, s, F);
         const int patches = P - from < 0 ? 0 : (P - from < 32 ? P - from : 32);
         __builtin_memcpy(heard.data + ((long)row * P + from) * F, s, 4l * patches * F);
         for (int i = patches; i < many; i++) {
-            Tiles::norm(x + i * E, E, c);
+            Vector::norm(x + i * E, E, c);
             for (int o = 0; o < 3; o++) {
                 v16 sum = {};
                 const float* w = b + F + 3 + o * E;
-                for (int j = 0; j < E; j += 16) sum = Tiles::fma(Tiles::load(w + j), Tiles::load(c + j), sum);
-                velocity.data[((long)row * C + from + i - P) * 3 + o] = Tiles::total(sum) + b[F + o];
+                for (int j = 0; j < E; j += 16) sum = Vector::fma(Vector::load(w + j), Vector::load(c + j), sum);
+                velocity.data[((long)row * C + from + i - P) * 3 + o] = Vector::total(sum) + b[F + o];
             }
         }
     }
@@ -214,9 +204,9 @@ STAGE = source(
     SIZES
     + """
     alignas(64) float c[32 * 256], s[32 * 1024], open[1024], scale[32];
-    alignas(64) __bf16 hi[32 * 1024], lo[32 * 1024];
+    LEFT(left, 32 * 1024);
     const int row = t / blocks, from = 32 * (t % blocks), many = T - from < 32 ? T - from : 32;
-    const long layer_weights = 2l * E * (Q + E + 2 * H), layer_biases = Q + 2 * E + H;
+    const long layer_weights = (long)E * (Q + E + 2 * H), layer_biases = Q + 2 * E + H;
     const long stride = (long)Tp * (2 * E + F) + 2l * Tp * Q;
     float* mine = room.data + row * stride;
     float* x = mine + (long)from * E;
@@ -231,26 +221,26 @@ STAGE = source(
                 v16 mean = {};
                 for (int p = 0; token < C && p < P; p++) {
                     const float part = pieces.data[((long)(row % layouts) * C + token) * P + p];
-                    mean = Tiles::fma(Tiles::all(part), Tiles::load(y + (long)p * F + j), mean);
+                    mean = Vector::fma(Vector::all(part), Vector::load(y + (long)p * F + j), mean);
                 }
-                Tiles::store(c + j, mean);
+                Vector::store(c + j, mean);
             }
             for (int e = 0; e < E; e++) {
                 v16 sum = {};
                 const float* w = lift + (long)e * F;
-                for (int j = 0; j < F; j += 16) sum = Tiles::fma(Tiles::load(w + j), Tiles::load(c + j), sum);
-                x[i * E + e] = token < C ? given.data[((long)row * C + token) * E + e] + Tiles::total(sum) : 0.0f;
+                for (int j = 0; j < F; j += 16) sum = Vector::fma(Vector::load(w + j), Vector::load(c + j), sum);
+                x[i * E + e] = token < C ? given.data[((long)row * C + token) * E + e] + Vector::total(sum) : 0.0f;
             }
             __builtin_memcpy(x + ((long)Tp + i) * E, x + i * E, 4l * E);
         }
     }
-    Tiles::begin();
+    Matrix::begin();
 """
     + LAYER
     + KEYS
     + LAST
     + """
-    Tiles::end();
+    Matrix::end();
 """
 )
 
@@ -264,7 +254,7 @@ def stage_block(
     pieces: wp.array[wp.float32],
     geodesic: wp.array[wp.float32],
     mask: wp.array[wp.uint8],
-    weights: wp.array[wp.int16],
+    weights: wp.array[wp.float32],
     biases: wp.array[wp.float32],
     given: wp.array[wp.float32],
     room: wp.array[wp.float32],

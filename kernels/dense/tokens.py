@@ -1,4 +1,4 @@
-"""The encoder layers of patches on the tiles of tiles.py: pooling, attention and feed-forward in one launch each.
+"""The encoder layers of patches on the products of products.py: pooling, attention and feed-forward in one launch each.
 
 A thread works on a block of 32 tokens of a row. A row has P patches and C velocities, T = P + C tokens x [T,E]:
 
@@ -23,7 +23,7 @@ from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
-from .tiles import BLOCK, argument
+from .products import BLOCK, argument
 from .token_blocks import pool_block, stage_block
 
 wp.set_module_options(compiling.options())
@@ -42,7 +42,7 @@ def pool_kernel(
     start: wp.array[wp.int64],
     member: wp.array[wp.int64],
     weight: wp.array[wp.float32],
-    packed: wp.array[wp.int16],
+    packed: wp.array[wp.float32],
     bias: wp.array[wp.float32],
     # In:
     faces: wp.array[wp.float32],
@@ -62,7 +62,7 @@ def stage_kernel(
     pieces: wp.array[wp.float32],
     geodesic: wp.array[wp.float32],
     mask: wp.array[wp.uint8],
-    weights: wp.array[wp.int16],
+    weights: wp.array[wp.float32],
     biases: wp.array[wp.float32],
     # In:
     given: wp.array[wp.float32],

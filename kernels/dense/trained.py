@@ -1,4 +1,4 @@
-"""A layer of faces on the tiles of tiles.py with its gradients, for training.
+"""A layer of faces on the products of products.py with its gradients, for training.
 
 With n(x) = (x - mean) / deviation over the numbers of a face, and m the mean of n over three neighbours:
 
@@ -21,7 +21,7 @@ from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
-from .tiles import BLOCK, argument
+from .products import BLOCK, argument
 from .trained_blocks import back_block, gradient_part, layer_block, norm_block
 
 wp.set_module_options(compiling.options())
@@ -53,9 +53,9 @@ def layer_kernel(
     hears: wp.int32,
     # Model:
     side: wp.array[wp.int64],
-    expand: wp.array[wp.int16],
+    expand: wp.array[wp.float32],
     expand_bias: wp.array[wp.float32],
-    contract: wp.array[wp.int16],
+    contract: wp.array[wp.float32],
     contract_bias: wp.array[wp.float32],
     # In:
     faces: wp.array[wp.float32],
@@ -92,8 +92,8 @@ def gradient_kernel(
     hears: wp.int32,
     # Model:
     side: wp.array[wp.int64],
-    expand: wp.array[wp.int16],
-    contract: wp.array[wp.int16],
+    expand: wp.array[wp.float32],
+    contract: wp.array[wp.float32],
     # In:
     own: wp.array[wp.float32],
     inner: wp.array[wp.float32],
@@ -149,7 +149,7 @@ class Around(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Weights with the norm folded in; those of `tiles.pack` are int16."""
+    """Weights with the norm folded in; packed are those of `products.pack`."""
 
     expand: torch.Tensor  # packed, of W [H,I] with I = F, or 2 F for faces that hear their neighbours
     expand_bias: torch.Tensor  # [H]

@@ -1,4 +1,4 @@
-"""Weights of a first layer, turned to the heading of a garment and packed for the tiles of tiles.py, in one launch.
+"""Weights of a first layer, turned to the heading of a garment and packed for products.py, in one launch.
 
     W [G (f - G^T m)] = (W G) (f - m G)        G [K,K] turns the K features of a frame, m is their mean
 
@@ -14,7 +14,7 @@ from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch, torch_stream
 from warpgarment.kernels.operator import allocate
 
-from .tiles import argument, padded, source
+from .products import argument, padded, source
 
 wp.set_module_options(compiling.options())
 
@@ -27,8 +27,7 @@ VECTOR = 16
     const int features = frames * channels, depth = (features + 31) / 32, wide = (channels + 15) / 16 * 16;
     const float* turn = turns.data + (long)row * channels * wide;
     alignas(64) float line[1024 + 32];
-    alignas(64) __bf16 both[2][32];
-    __bf16* to = (__bf16*)result.data + ((long)row * outputs16 + tile) * depth * 1024;
+    float* to = result.data + ((long)row * outputs16 + tile) * depth * 512;
     for (int n = -1; n < 16; n++) {
         if (n < 0 && tile) continue;
         const float* from = n < 0 ? mean.data : weight.data + (long)(16 * tile + n) * features;
@@ -37,21 +36,16 @@ VECTOR = 16
                 v16 sum = {};
                 const float* at = from + (n < 0 ? 0 : h * channels);
                 for (int i = 0; i < channels; i++)
-                    sum = Tiles::fma(Tiles::all(at[i]), Tiles::load(turn + i * wide + j), sum);
-                Tiles::store(line + h * channels + j, sum);
+                    sum = Vector::fma(Vector::all(at[i]), Vector::load(turn + i * wide + j), sum);
+                Vector::store(line + h * channels + j, sum);
             }
         for (int k = features; k < 32 * depth; k++) line[k] = 0.0f;
         if (n < 0) {
             __builtin_memcpy(centre.data + (long)row * 32 * depth, line, 128l * depth);
             continue;
         }
-        for (int k = 0; k < depth; k++) {
-            for (int half = 0; half < 32; half += 16)
-                Tiles::split(Tiles::load(line + 32 * k + half), both[0] + half, both[1] + half);
-            for (int part = 0; part < 2; part++)
-                for (int pair = 0; pair < 16; pair++)
-                    ((int*)to)[((2 * k + part) * 16 + pair) * 16 + n] = ((int*)both[part])[pair];
-        }
+        for (int k = 0; k < depth; k++)
+            Matrix::column(to + 512 * k, n, Vector::load(line + 32 * k), Vector::load(line + 32 * k + 16));
     }
 """)
 )
@@ -64,7 +58,7 @@ def turned_tile(
     mean: wp.array[wp.float32],
     turns: wp.array[wp.float32],
     centre: wp.array[wp.float32],
-    result: wp.array[wp.int16],
+    result: wp.array[wp.float32],
 ): ...
 
 
@@ -80,7 +74,7 @@ def turned_kernel(
     turns: wp.array[wp.float32],
     # Out:
     centre: wp.array[wp.float32],
-    result: wp.array[wp.int16],
+    result: wp.array[wp.float32],
 ):
     turned_tile(wp.tid(), outputs, frames, channels, weight, mean, turns, centre, result)
 
@@ -100,12 +94,12 @@ def turned(weight: torch.Tensor, mean: torch.Tensor, turns: torch.Tensor) -> tup
 
     Returns:
         What is to be subtracted from features in world space, shape [R,I'] with I' from `padded`; weights as from
-        `tiles.pack`, as int16, shape [R, O I' 2].
+        `products.pack`, shape [R, O I'].
     """
     outputs, frames, channels = weight.shape
     rows, inputs = len(turns), padded(frames * channels)
     centre = allocate((rows, inputs), torch.float32, weight.device)
-    result = allocate((rows, 2 * outputs * inputs), torch.int16, weight.device)
+    result = allocate((rows, outputs * inputs), torch.float32, weight.device)
     given = [argument(values) for values in (weight, mean, turns)]
     with torch_stream(weight.device) as device:
         written = [argument(centre), argument(result)]

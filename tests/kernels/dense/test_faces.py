@@ -1,4 +1,4 @@
-"""Layers of faces on tiles against the same layers in float64, with numbers of faces that are no whole blocks."""
+"""Layers of faces by kernels against the same layers in float64, with numbers of faces that are no whole blocks."""
 
 import pytest
 import torch
@@ -6,14 +6,14 @@ import torch.nn.functional as F
 from support.comparing import close
 from support.poison import poison_outputs
 
-from warpgarment.kernels.dense import faces, tiles
+from warpgarment.kernels.dense import faces, products
 from warpgarment.kernels.dense.turned import turned
 
-pytestmark = pytest.mark.skipif(not tiles.available(), reason="this processor has no tiles for bfloat16 (AMX)")
+pytestmark = pytest.mark.skipif(not products.available(), reason="this processor has no vectors")
 
 ROWS, COUNT, WIDTH, HIDDEN = 2, 75, 96, 64  # 75 faces: two blocks of 32 and one of 11
-OFF = 1e-4
-"""Products of numbers around one lose 2^-17 of each term: 1e-5 in a sum of a hundred. bfloat16 alone: 1e-2."""
+OFF = 1e-4 if products.ON_TILES else 1e-5
+"""On tiles, products of numbers around one lose 2^-17 of each term: 1e-5 in a sum of a hundred; bfloat16 alone 1e-2."""
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -21,7 +21,7 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def packed(weight: torch.Tensor) -> torch.Tensor:
-    return tiles.pack(weight).view(torch.int16).flatten()
+    return products.pack(weight).flatten()
 
 
 def perceptron(inputs: int = WIDTH):
@@ -36,20 +36,22 @@ def norm(x: torch.Tensor) -> torch.Tensor:
     return F.layer_norm(x.double(), (WIDTH,))
 
 
-def test_packed_numbers_are_the_weights_in_tiles():
-    """A product would multiply by other weights: tiles hold pairs of inputs of sixteen outputs, hi and lo apart.
+def test_packed_numbers_are_the_weights():
+    """A product would multiply by other weights, or by what lies beyond them.
 
-    The sum of both is the weight to 2^-17 of it.
+    Tiles hold the weights themselves or, for AMX, pairs of inputs of sixteen outputs, hi and lo apart, whose sum is the
+    weight to 2^-17 of it.
     """
     weight = normal(40, 70)
-    both = tiles.pack(weight).double()
-    assert both.shape == (4, 3, 2, 16, 16, 2)
-    whole = both.sum(dim=2)
-    for o, i in ((0, 0), (17, 5), (39, 69), (39, 68)):
-        found = whole[o // 16, i // 32, i % 32 // 2, o % 16, i % 2]
-        assert abs(found - weight[o, i]) <= 2.0**-17 * abs(weight[o, i])
-    assert whole[2, :, :, 8:].abs().max() == 0.0
-    assert whole[:, 2, 3:].abs().max() == 0.0
+    found = products.pack(weight)
+    assert found.shape == (4, 3, 512)
+    if products.ON_TILES:
+        both = found.view(torch.bfloat16).double().reshape(4, 3, 2, 16, 16, 2)
+        found = both.sum(dim=2).transpose(3, 4).reshape(4, 3, 512)
+    whole = found.reshape(4, 3, 32, 16).permute(0, 3, 1, 2).reshape(64, 96)
+    close(whole[:40, :70], weight.double(), (2.0**-17 if products.ON_TILES else 0.0) * weight.abs().max().item())
+    assert whole[40:].abs().max() == 0.0
+    assert whole[:, 70:].abs().max() == 0.0
 
 
 def test_turned_weights(monkeypatch):

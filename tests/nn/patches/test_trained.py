@@ -1,4 +1,4 @@
-"""A layer of faces on tiles in training, beside the same layer by torch in float64."""
+"""A layer of faces by kernels in training, beside the same layer by torch in float64."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import copy
 import pytest
 import torch
 
-from warpgarment.kernels.dense import tiles
+from warpgarment.kernels.dense import products
 from warpgarment.nn.patches import trained
 from warpgarment.nn.patches.bags import Bags, Sums
 from warpgarment.nn.patches.network import FaceLayer
 
-pytestmark = pytest.mark.skipif(not tiles.available(), reason="no tiles (AMX)")
+pytestmark = pytest.mark.skipif(not products.available(), reason="this processor has no vectors")
 
 
 def layer_of(width: int, hidden: int, hears: bool) -> FaceLayer:

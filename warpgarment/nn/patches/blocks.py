@@ -8,7 +8,7 @@ gets the same bits with any number of threads and in any batch. Operators are th
     garments              pooling, encoder layers, change of the patches
     faces, by blocks      the change spread to faces, norm; for each further face layer: the layer, the next norm; head
 
-Where the processor has tiles (AMX), tiled.py does the same by kernels.
+Where the widths are whole numbers of vectors, fused.py does the same by kernels; this is for all other networks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from warpgarment.kernels.threads import spread, torch_on_one
 from warpgarment.nn.attention import one_by_one
 
-from . import tiled
+from . import fused
 
 if TYPE_CHECKING:
     from .layout import PatchLayout
@@ -85,8 +85,8 @@ def forward(
     """
     rows, count, width = faces.shape
     patches = layout.start.shape[1]
-    if tiled.fits(network, patches + tokens.shape[1]):
-        return tiled.forward(network, faces, tokens, layout, mask)
+    if fused.fits(network, patches + tokens.shape[1]):
+        return fused.forward(network, faces, tokens, layout, mask)
     own = list(torch.empty((2, *faces.shape)))
     heard = faces.new_empty((rows, patches, width))
     answer = faces.new_empty((rows, count, network.face_head.out_features))

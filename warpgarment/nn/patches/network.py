@@ -26,7 +26,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import NormalisedOutput, RowInputs
 from warpgarment.nn.network import GarmentNetwork
 
-from . import blocks, first, tiled, trained
+from . import blocks, first, fused, trained
 from .bags import Sums, sums_of
 from .layout import PatchLayout
 
@@ -78,8 +78,8 @@ class PatchTransformer(GarmentNetwork):
 
     @property
     def launches(self) -> tuple[str, ...]:
-        """As in `GarmentNetwork`, and the kernels of its layers on a processor that has tiles."""
-        return (*super().launches, *(tiled.LAUNCHED if tiled.suits(self) else ()))
+        """As in `GarmentNetwork`, and the kernels of its layers on a processor that has vectors for them."""
+        return (*super().launches, *(fused.LAUNCHED if fused.suits(self) else ()))
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
@@ -148,8 +148,8 @@ class PatchTransformer(GarmentNetwork):
         W ((G f - mean) / std) + b = (W / std) G f + (b - (W / std) mean)        G turns the features of a frame
         """
         face_features = self.read(self._without_padding(face_features, face_mask))
-        if blocks.by_blocks(face_features) and tiled.fits(self):
-            return tiled.embedded(self, face_features, turn)
+        if blocks.by_blocks(face_features) and fused.fits(self):
+            return fused.embedded(self, face_features, turn)
         weight = self.embed_faces.weight
         if self.outdoor.width:
             weight = weight[:, : -self.outdoor.width]

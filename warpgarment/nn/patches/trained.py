@@ -1,4 +1,4 @@
-"""A layer of faces in training on a processor with tiles (AMX): `kernels/dense/trained.py` as a function of autograd.
+"""A layer of faces in training on a CPU: `kernels/dense/trained.py` as a function of autograd.
 
 The scale g and shift s of the layer norm are part of the weights of the kernels, and their gradients follow from those:
 
@@ -14,10 +14,10 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from warpgarment.kernels.dense import tiles, trained
+from warpgarment.kernels.dense import products, trained
 
 from . import changes
-from .tiled import as_tiles
+from .fused import packed_weights
 
 if TYPE_CHECKING:
     from .bags import Sums
@@ -34,8 +34,8 @@ def fits(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> bool:
         return False
     if not torch.is_grad_enabled() or (layer.hears and around is None) or layer.expand.weight.dtype != torch.float32:
         return False
-    fit = all(size % tiles.STEP == 0 and size <= tiles.WIDEST for size in (width, hidden))
-    return fit and len(faces) > 0 and layer.activation is nn.functional.gelu and tiles.available()
+    fit = all(size % products.STEP == 0 and size <= products.WIDEST for size in (width, hidden))
+    return fit and len(faces) > 0 and layer.activation is nn.functional.gelu and products.available()
 
 
 def forward(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> torch.Tensor:
@@ -65,8 +65,8 @@ def _pack(layer: FaceLayer) -> trained.Weights:
     expand = torch.cat([part * layer.norm.weight for part in parts], dim=1)
     bias = layer.expand.bias + sum(part @ layer.norm.bias for part in parts)
     contract = layer.contract.weight
-    back = as_tiles(expand.T), as_tiles(contract.T)
-    return trained.Weights(as_tiles(expand), bias, as_tiles(contract), layer.contract.bias.detach(), *back)
+    back = packed_weights(expand.T), packed_weights(contract.T)
+    return trained.Weights(packed_weights(expand), bias, packed_weights(contract), layer.contract.bias.detach(), *back)
 
 
 def _around(around: Sums | None) -> trained.Around:

@@ -1,4 +1,4 @@
-"""The network of patches on a processor with tiles (AMX): the layers of faces as kernels of `kernels/dense`.
+"""The network of patches on a CPU as kernels of `kernels/dense`, which have all between two products in them.
 
 Weights are packed once per network. The scale and shift of a layer norm are part of the layer after it:
 
@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from warpgarment.kernels.dense import faces as dense
-from warpgarment.kernels.dense import tiles, tokens
+from warpgarment.kernels.dense import products, tokens
 from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
 from warpgarment.kernels.features.channels import Kind, Layout
 
@@ -72,22 +72,22 @@ _known: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()
 _fitting: WeakKeyDictionary[nn.Module, tuple[NetworkConfig, bool]] = WeakKeyDictionary()
 
 
-LAUNCHED = "dense.tokens", "dense.faces", "dense.turned", "dense.tiles"
+LAUNCHED = "dense.tokens", "dense.faces", "dense.turned", "dense.products"
 """Modules of `warpgarment.kernels` with the kernels of the layers, slow ones first."""
 
 
 def fits(network: PatchTransformer, count: int = 0) -> bool:
     """Whether the kernels can do this network's layers, on rows of that many tokens and on this processor."""
-    return suits(network, count) and tiles.available()
+    return suits(network, count) and products.available()
 
 
 def suits(network: PatchTransformer, count: int = 0) -> bool:
-    """Whether this processor has tiles, and the network's widths are whole numbers of them; nothing is compiled."""
+    """Whether this processor has vectors, and the widths are whole numbers of tiles; nothing is compiled."""
     config, fit = _fitting.get(network, (None, False))
     if config is not network.config:
         config, fit = network.config, _widths_fit(network.config)
         _fitting[network] = config, fit
-    return fit and count <= tokens.MOST_TOKENS and tiles.present()
+    return fit and count <= tokens.MOST_TOKENS and products.present()
 
 
 def _widths_fit(config: NetworkConfig) -> bool:
@@ -95,8 +95,8 @@ def _widths_fit(config: NetworkConfig) -> bool:
     widths = (config.face_embedding, config.face_feed_forward, config.embedding, config.feed_forward)
     head = config.embedding // config.heads
     columns = 3 * config.embedding - 2 * config.manifold_heads * head
-    fit = all(width % tiles.STEP == 0 and width <= tiles.WIDEST for width in widths)
-    fit = fit and head % tiles.STEP == 0 and columns <= tokens.MOST_COLUMNS and config.inputs <= MOST_INPUTS
+    fit = all(width % products.STEP == 0 and width <= products.WIDEST for width in widths)
+    fit = fit and head % products.STEP == 0 and columns <= tokens.MOST_COLUMNS and config.inputs <= MOST_INPUTS
     return fit and config.norm_first and config.activation == "gelu"
 
 
@@ -135,7 +135,7 @@ def _pack(network: PatchTransformer) -> Packed:
         _perceptron(network.before, hears=False),
         [_perceptron(layer, hears=True) for layer in layers],
         [_perceptron(layer, hears=False) for layer in layers],
-        dense.Head(as_tiles(head), head_bias),
+        dense.Head(packed_weights(head), head_bias),
         _encoder(network),
     )
 
@@ -188,16 +188,16 @@ def _encoder(network: PatchTransformer) -> tokens.Encoder:
         head,
         config.feed_forward,
         config.layers,
-        as_tiles(network.to_patches.weight),
+        packed_weights(network.to_patches.weight),
         network.to_patches.bias.detach(),
-        torch.cat([as_tiles(weight) for weight in weights]),
+        torch.cat([packed_weights(weight) for weight in weights]),
         torch.cat([values.flatten() for values in biases]),
     )
 
 
-def as_tiles(weight: torch.Tensor) -> torch.Tensor:
-    """Packed weights in one dimension, as int16."""
-    return tiles.pack(weight).view(torch.int16).flatten()
+def packed_weights(weight: torch.Tensor) -> torch.Tensor:
+    """Packed weights in one dimension."""
+    return products.pack(weight).flatten()
 
 
 def folded(norm: nn.Module, weight: torch.Tensor, bias: torch.Tensor | Any) -> tuple[torch.Tensor, torch.Tensor]:
@@ -211,7 +211,9 @@ def _perceptron(layer: FaceLayer, *, hears: bool) -> dense.Perceptron:
     if hears:
         around, bias = folded(layer.norm, layer.hear.weight, bias)
         weight = torch.cat([weight, around], dim=1)
-    return dense.Perceptron(as_tiles(weight), bias, as_tiles(layer.contract.weight), layer.contract.bias.detach())
+    return dense.Perceptron(
+        packed_weights(weight), bias, packed_weights(layer.contract.weight), layer.contract.bias.detach()
+    )
 
 
 def embedded(network: PatchTransformer, features: torch.Tensor, turn: torch.Tensor | None) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""The network of patches on tiles: the same network as torch's, and always with its newest weights."""
+"""The network of patches by kernels: the same network as torch's, and always with its newest weights."""
 
 import copy
 
@@ -8,15 +8,15 @@ from support.comparing import close
 from support.meshes import irregular_grid, skirt, two_components
 
 import warpgarment as wg
-from warpgarment.kernels.dense import tiles
+from warpgarment.kernels.dense import products
 from warpgarment.kernels.features.channels import FACE, FEATURES, INTERACTION
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.patches import tiled
+from warpgarment.nn.patches import fused
 from warpgarment.nn.patches.layout import garment_patches, patch_layout
 from warpgarment.nn.patches.network import PatchTransformer
 from warpgarment.objects.garment import Garment
 
-pytestmark = pytest.mark.skipif(not tiles.available(), reason="this processor has no tiles for bfloat16 (AMX)")
+pytestmark = pytest.mark.skipif(not products.available(), reason="this processor has no vectors")
 
 WIDTHS = {"embedding": 64, "feed_forward": 96, "heads": 2, "manifold_heads": 1, "face_embedding": 32}
 SHAPE = WIDTHS | {"face_feed_forward": 64, "history": 3, "patch_spacing": 0.15, "layers": 2}
@@ -24,7 +24,7 @@ GARMENTS = [Garment(*mesh) for mesh in (irregular_grid(8, 5), two_components(), 
 
 
 def network(**changes) -> PatchTransformer:
-    """A network with random weights and statistics that tiles can do."""
+    """A network with random weights and statistics that the kernels can do."""
     torch.manual_seed(0)
     made = PatchTransformer(
         NetworkConfig.fast(
@@ -34,7 +34,7 @@ def network(**changes) -> PatchTransformer:
     for parameter in made.parameters():
         torch.nn.init.normal_(parameter, std=0.15)
     made.set_statistics({"feature_mean": torch.randn(FEATURES), "feature_std": torch.rand(FEATURES) + 0.5})
-    assert tiled.fits(made)
+    assert fused.fits(made)
     return made.eval()
 
 
@@ -58,14 +58,14 @@ def batch(made: PatchTransformer, *garments: Garment):
 def test_it_is_the_network_of_torch(heading, chosen, monkeypatch):
     """A rollout would use another network than training made: a bias not folded, a padded garment heard.
 
-    Beside the same in torch: 1e-4 of outputs around one, since products lose 2^-17 of each term.
+    Beside the same in torch: 1e-4 of outputs around one, since products on tiles lose 2^-17 of each term.
     """
     made = network(heading=heading)
     features, velocities, layout, faces, pieces = batch(made, *(GARMENTS[k] for k in chosen))
     with torch.no_grad():
         result = made(features, velocities, layout, face_mask=faces, velocity_mask=pieces)
-        monkeypatch.setattr(tiles, "available", lambda: False)
-        assert not tiled.fits(made)
+        monkeypatch.setattr(products, "available", lambda: False)
+        assert not fused.fits(made)
         expected = made(features, velocities, layout, face_mask=faces, velocity_mask=pieces)
     for one, other, mask in zip(result, expected, (faces, faces, pieces), strict=True):
         close(one[mask], other[mask], 1e-4 * max(1.0, other[mask].abs().max().item()))
@@ -77,7 +77,7 @@ def test_factors_of_a_turn():
     turn = torch.randn(1, 3, 3)
     entries = torch.cat([turn.flatten(), torch.tensor([1.0, 0.0])])
     for layout in (FACE, FACE.only(FACE.names[2:5]), INTERACTION):
-        first, second = tiled.factors(layout)
+        first, second = fused.factors(layout)
         found = (entries[first] * entries[second]).reshape(layout.width, -1)
         assert torch.equal(found[:, : layout.width], layout.turn(turn)[0])
         assert not found[:, layout.width :].any()
@@ -96,7 +96,7 @@ def test_no_layers_after_the_patches_and_subsets_of_faces(monkeypatch):
         with torch.no_grad():
             result = some(features, velocities, weights)
             with monkeypatch.context() as patched:
-                patched.setattr(tiles, "available", lambda: False)
+                patched.setattr(products, "available", lambda: False)
                 expected = some(features, velocities, weights)
         for one, other in zip(result, expected, strict=True):
             close(one, other, 1e-4 * max(1.0, other.abs().max().item()))
@@ -138,13 +138,13 @@ def test_gradients_and_other_widths_are_torchs(monkeypatch):
     """Training would lose its gradients in a kernel that has none, or a kernel read beyond a narrow layer."""
     made = network()
     features, velocities, layout, *_ = batch(made, GARMENTS[0])
-    monkeypatch.setattr(tiled, "packed", None)  # not to be called
+    monkeypatch.setattr(fused, "packed", None)  # not to be called
     made(features, velocities, layout).psi.sum().backward()
     assert made.embed_faces.weight.grad.any()
     for changes in ({"face_embedding": 48}, {"heads": 4}, {"embedding": 288, "heads": 9}, {"activation": "relu"}):
-        assert not tiled.fits(PatchTransformer(NetworkConfig.fast(**(WIDTHS | changes))))
+        assert not fused.fits(PatchTransformer(NetworkConfig.fast(**(WIDTHS | changes))))
 
 
 def test_the_bundled_network_fits():
     """The network that most use would be at torch's speed."""
-    assert tiled.fits(wg.Simulator.from_pretrained("fast", device="cpu").network)
+    assert fused.fits(wg.Simulator.from_pretrained("fast", device="cpu").network)
