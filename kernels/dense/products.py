@@ -93,9 +93,10 @@ struct Matrix {
         __builtin_ia32_tile_loadconfig(c);
     }
     static void end() { __builtin_ia32_tilerelease(); }
-    // a has lda numbers a row; b is packed with `depth` steps in all, of which the first is `from`
+    // a has lda numbers a row; b is packed with `depth` steps in all, of which the first is `from`; rows of c beyond
+    // `down` need not be computed
     static void product(Left a, int lda, const float* right, int from, int steps, int depth, int columns, float* c,
-                        int ldc) {
+                        int ldc, int down = 32) {
         const __bf16 *hi = a.hi, *lo = a.lo, *b = (const __bf16*)right;
         long down = 16 * (long)lda, a_row = 2 * (long)lda, c_row = 4 * (long)ldc;
         for (int n = 0; n < columns; n += 32) {
@@ -168,7 +169,7 @@ struct Matrix {
 #else
     enum { ALONG = 1 };
 #endif
-    // c [down, 16 ALONG] += x [down, deep] b; all sums stay in registers, since `down` is a number where this is inlined
+    // c [down, 16 ALONG] += x [down, deep] b; sums stay in registers, since `down` is a number where this is inlined
     __attribute__((always_inline)) static inline void part(const int down, const float* x, int lda, const float* b,
                                                            long next, int deep, float* c, int ldc) {
         v16 sum[8][ALONG];
@@ -185,20 +186,21 @@ struct Matrix {
         for (int i = 0; i < down; i++)
             for (int j = 0; j < ALONG; j++) Vector::store(c + (long)i * ldc + 16 * j, sum[i][j]);
     }
-    // a has lda numbers a row; b is packed with `depth` steps in all, of which the first is `from`
+    // a has lda numbers a row; b is packed with `depth` steps in all, of which the first is `from`; rows of c beyond
+    // `down` need not be computed
     static void product(Left a, int lda, const float* right, int from, int steps, int depth, int columns, float* c,
-                        int ldc) {
+                        int ldc, int down = 32) {
         const long next = 512l * depth;
         for (int n = 0; n < columns; n += 16 * ALONG) {
             const float* b = right + (n / 16) * next + 512l * from;
             const int deep = 32 * steps;
 #ifdef __AVX512F__
-            for (int m = 0; m < 32; m += 8)
+            for (int m = 0; m < down; m += 8)
                 part(8, a.all + (long)m * lda, lda, b, next, deep, c + (long)m * ldc + n, ldc);
 #else
-            for (int m = 0; m < 24; m += 6)
+            for (int m = 0; m < 24 && m < down; m += 6)
                 part(6, a.all + (long)m * lda, lda, b, next, deep, c + (long)m * ldc + n, ldc);
-            for (int m = 24; m < 32; m += 4)
+            for (int m = 24; m < down; m += 4)
                 part(4, a.all + (long)m * lda, lda, b, next, deep, c + (long)m * ldc + n, ldc);
 #endif
         }

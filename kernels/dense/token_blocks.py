@@ -81,15 +81,15 @@ LAYER = """
         const float* k = q + (long)Tp * L;
         const float* v = q + 2l * Tp * L;
         for (int j = 0; j < Tp; j++) open[j] = j < T && (!masks || mask.data[(long)row * T + j]) ? 1.0f : 0.0f;
-        for (int i = 0; i < 32 * E; i += 16) Vector::store(c + i, v16{});
+        for (int i = 0; i < down * E; i += 16) Vector::store(c + i, v16{});
         for (int h = 0; h < L / D; h++) {
-            for (int i = 0; i < 32; i++) {
+            for (int i = 0; i < down; i++) {
                 for (int j = 0; j < D; j += 16)
                     left.put(i * D + j, Vector::load(q + (long)(from + i) * L + h * D + j));
                 for (int j = 0; j < Tp; j += 16) Vector::store(s + i * Tp + j, v16{});
             }
-            Matrix::product(left, D, k + (long)h * Tp * D, 0, D / 32, D / 32, Tp, s, Tp);
-            for (int i = 0; i < 32; i++) {
+            Matrix::product(left, D, k + (long)h * Tp * D, 0, D / 32, D / 32, Tp, s, Tp, down);
+            for (int i = 0; i < down; i++) {
                 v16 most = Vector::all(-1e30f), sum = {};
                 for (int j = 0; j < Tp; j += 16)
                     most = __builtin_elementwise_max(most, Vector::load(open + j) > 0.0f ? Vector::load(s + i * Tp + j)
@@ -104,29 +104,29 @@ LAYER = """
                 }
                 scale[i] = 1.0f / Vector::total(sum);
             }
-            Matrix::product(left, Tp, v + (long)h * D * Tp, 0, blocks, blocks, D, c + h * D, E);
-            for (int i = 0; i < 32; i++)
+            Matrix::product(left, Tp, v + (long)h * D * Tp, 0, blocks, blocks, D, c + h * D, E, down);
+            for (int i = 0; i < down; i++)
                 for (int j = h * D; j < h * D + D; j += 16)
                     Vector::store(c + i * E + j, Vector::load(c + i * E + j) * Vector::all(scale[i]));
         }
         if (L < E) {
             const float* g = geodesic.data + (long)(row % layouts) * P * P;
-            for (int i = 0; i < 32; i++)
+            for (int i = 0; i < down; i++)
                 for (int j = 0; j < Tp; j += 16) {
                     const int r = from + i;
                     v16 a = Vector::load(g + (long)r * P + j, r < P ? P - j : 0);
                     if (r >= P && r < T && j <= r && r < j + 16) a[r - j] = 1.0f;
                     left.put(i * Tp + j, a);
                 }
-            Matrix::product(left, Tp, v + (long)L * Tp, 0, blocks, blocks, E - L, c + L, E);
+            Matrix::product(left, Tp, v + (long)L * Tp, 0, blocks, blocks, E - L, c + L, E, down);
         }
-        for (int i = 0; i < 32; i++)
+        for (int i = 0; i < down; i++)
             for (int j = 0; j < E; j += 16) {
                 left.put(i * E + j, Vector::load(c + i * E + j));
                 Vector::store(x + i * E + j, Vector::load(x + i * E + j) + Vector::load(b + Q + j));
             }
-        Matrix::product(left, E, w + (long)E * Q, 0, E / 32, E / 32, E, x, E);
-        for (int i = 0; i < 32; i++) {  // feed-forward
+        Matrix::product(left, E, w + (long)E * Q, 0, E / 32, E / 32, E, x, E, down);
+        for (int i = 0; i < down; i++) {  // feed-forward
             Vector::norm(x + i * E, E, c);
             for (int j = 0; j < E; j += 16) {
                 left.put(i * E + j, Vector::load(c + j));
@@ -134,9 +134,9 @@ LAYER = """
             }
             for (int j = 0; j < H; j += 16) Vector::store(s + i * H + j, Vector::load(b + Q + E + j));
         }
-        Matrix::product(left, E, w + (long)E * (Q + E), 0, E / 32, E / 32, H, s, H);
-        for (int i = 0; i < 32 * H; i += 16) left.put(i, Vector::gelu(Vector::load(s + i)));
-        Matrix::product(left, H, w + (long)E * (Q + E + H), 0, H / 32, H / 32, E, x, E);
+        Matrix::product(left, E, w + (long)E * (Q + E), 0, E / 32, E / 32, H, s, H, down);
+        for (int i = 0; i < down * H; i += 16) left.put(i, Vector::gelu(Vector::load(s + i)));
+        Matrix::product(left, H, w + (long)E * (Q + E + H), 0, H / 32, H / 32, E, x, E, down);
     }
 """
 
@@ -147,12 +147,12 @@ KEYS = """
         float* q = (float*)keys_of(stage);
         float* k = q + (long)Tp * L;
         float* v = q + 2l * Tp * L;
-        for (int i = 0; i < 32; i++) {
+        for (int i = 0; i < down; i++) {
             Vector::norm(x + i * E, E, c);
             for (int j = 0; j < E; j += 16) left.put(i * E + j, Vector::load(c + j));
             for (int j = 0; j < Q; j += 16) Vector::store(s + i * Q + j, Vector::load(b + j));
         }
-        Matrix::product(left, E, w, 0, E / 32, E / 32, Q, s, Q);
+        Matrix::product(left, E, w, 0, E / 32, E / 32, Q, s, Q, down);
         for (int i = 0; i < 32; i++) {
             if (i >= many)
                 for (int j = 0; j < Q; j += 16) Vector::store(s + i * Q + j, v16{});
@@ -177,7 +177,7 @@ LAST = """
     if (stage == layers) {
         const float* b = biases.data + layers * layer_biases;
         const float* at_start = x + (long)Tp * E;
-        for (int i = 0; i < 32; i++) {
+        for (int i = 0; i < down; i++) {
             for (int j = 0; j < E; j += 16) {
                 v16 change = Vector::load(x + i * E + j) - Vector::load(at_start + i * E + j);
                 left.put(i * E + j, change);
@@ -185,7 +185,7 @@ LAST = """
             for (int j = 0; j < F; j += 16) Vector::store(s + i * F + j, Vector::load(b + j));
         }
         const float* w = weights.data + layers * layer_weights;
-        Matrix::product(left, E, w, 0, E / 32, E / 32, F, s, F);
+        Matrix::product(left, E, w, 0, E / 32, E / 32, F, s, F, down);
         const int patches = P - from < 0 ? 0 : (P - from < 32 ? P - from : 32);
         __builtin_memcpy(heard.data + ((long)row * P + from) * F, s, 4l * patches * F);
         for (int i = patches; i < many; i++) {
@@ -206,6 +206,7 @@ STAGE = source(
     alignas(64) float c[32 * 256], s[32 * 1024], open[1024], scale[32];
     LEFT(left, 32 * 1024);
     const int row = t / blocks, from = 32 * (t % blocks), many = T - from < 32 ? T - from : 32;
+    const int down = (many + 7) / 8 * 8;
     const long layer_weights = (long)E * (Q + E + 2 * H), layer_biases = Q + 2 * E + H;
     const long stride = (long)Tp * (2 * E + F) + 2l * Tp * Q;
     float* mine = room.data + row * stride;
@@ -214,7 +215,7 @@ STAGE = source(
     auto keys_of = [=](int number) { return y + (long)Tp * F + (number % 2) * (long)Tp * Q; };
     if (stage == 0) {
         const float* lift = biases.data + layers * layer_biases + F + 3 + 3 * E;
-        for (int i = 0; i < 32; i++) {
+        for (int i = 0; i < down; i++) {
             const int token = from + i - P;
             if (token < 0) continue;
             for (int j = 0; j < F; j += 16) {
