@@ -96,7 +96,7 @@ struct Matrix {
     // a has lda numbers a row; b is packed with `depth` steps in all, of which the first is `from`; rows of c beyond
     // `down` need not be computed
     static void product(Left a, int lda, const float* right, int from, int steps, int depth, int columns, float* c,
-                        int ldc, int down = 32) {
+                        int ldc, int = 32) {
         const __bf16 *hi = a.hi, *lo = a.lo, *b = (const __bf16*)right;
         long down = 16 * (long)lda, a_row = 2 * (long)lda, c_row = 4 * (long)ldc;
         for (int n = 0; n < columns; n += 32) {
