@@ -33,8 +33,12 @@ PLACE = """
         const int steps = depth - k < 8 ? depth - k : 8;
         for (int i = 0; i < 32; i++)
             for (int j = 0; j < 32 * steps; j += 16) {
-                const float* f = features.data + (at + i) * pitch + 32 * k + j;
-                const v16 x = Vector::load(f, i < many ? columns - 32 * k - j : 0);
+                const long face = i < many ? index.data[at + i] : -1;
+                if (face < 0) {
+                    left.put(i * 256 + j, v16{});
+                    continue;
+                }
+                const v16 x = Vector::load(features.data + face * pitch + 32 * k + j, columns - 32 * k - j);
                 left.put(i * 256 + j, x - Vector::load(middle + 32 * k + j));
             }
         Matrix::product(left, 256, w, k, steps, depth, width, c, width);
@@ -51,6 +55,7 @@ def embed_block(
     pitch: int,
     width: int,
     packs: int,
+    index: wp.array[wp.int64],
     features: wp.array[wp.float32],
     centre: wp.array[wp.float32],
     weight: wp.array[wp.float32],

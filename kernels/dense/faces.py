@@ -45,11 +45,12 @@ def embed_kernel(
     weight: wp.array[wp.float32],
     bias: wp.array[wp.float32],
     # In:
+    index: wp.array[wp.int64],
     features: wp.array[wp.float32],
     # Out:
     result: wp.array[wp.float32],
 ):
-    embed_block(from_row + wp.tid(), count, columns, pitch, width, packs, features, centre, weight, bias, result)
+    embed_block(from_row + wp.tid(), count, columns, pitch, width, packs, index, features, centre, weight, bias, result)
 
 
 @wp.kernel(enable_backward=False)
@@ -179,11 +180,14 @@ def _launch(kernel: wp.Kernel, faces: torch.Tensor, inputs: list[object], output
         )
 
 
-def embed(features: torch.Tensor, centre: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+def embed(
+    features: torch.Tensor, index: torch.Tensor, centre: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
+) -> torch.Tensor:
     """The first layer.
 
     Args:
-        features: Features of all frames, shape [R,N,I].
+        features: Features of all frames of packed faces, shape [M,I].
+        index: Which of them the faces of each row are, int64 [R,N]; -1 for padding, which is embedded as zeros.
         centre: What is subtracted from them, from `turned.turned`, shape [R,I'] or [1,I'].
         weight: Packed weights of the same rows.
         bias: Biases, shape [F].
@@ -191,11 +195,11 @@ def embed(features: torch.Tensor, centre: torch.Tensor, weight: torch.Tensor, bi
     Returns:
         Embedded faces, shape [R,N,F].
     """
-    flat, pitch = rows_in_memory(features.flatten(0, 1))
-    result = allocate((*features.shape[:2], len(bias)), features.dtype, features.device)
-    sizes = [features.shape[2], pitch, len(bias), len(weight)]
-    given = [argument(values) for values in (centre, weight, bias, flat)]
-    _launch(embed_kernel, features, [*sizes, *given], [result])
+    flat, pitch = rows_in_memory(features)
+    result = allocate((*index.shape, len(bias)), features.dtype, features.device)
+    sizes = [features.shape[1], pitch, len(bias), len(weight)]
+    given = [argument(values) for values in (centre, weight, bias, index, flat)]
+    _launch(embed_kernel, index, [*sizes, *given], [result])
     return result
 
 

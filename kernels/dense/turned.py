@@ -89,8 +89,8 @@ def turned(weight: torch.Tensor, mean: torch.Tensor, turns: torch.Tensor) -> tup
         weight: Weights over the deviations of the features, shape [O,H,K]; O is a multiple of 32, H K at most
             `MOST_INPUTS`.
         mean: Mean of the features, shape [K].
-        turns: Rotation of the features of a frame for each garment, shape [R,K,K'], columns padded with zeros to a
-            multiple of `VECTOR`.
+        turns: Rotation of the features of a frame for each garment, shape [R,K,K'] or [R, K K'], columns padded with
+            zeros to a multiple of `VECTOR`.
 
     Returns:
         What is to be subtracted from features in world space, shape [R,I'] with I' from `padded`; weights as from

@@ -159,15 +159,11 @@ class GarmentNetwork(nn.Module):
             bfloat16: Whether the network runs in bfloat16, as in `run`.
         """
         assert isinstance(layout, RowLayout)
-        features, velocities = inputs.features.flatten(1), inputs.velocities.flatten(1)
+        features, velocities, outside = self.packed_inputs(inputs, layout)
         faces, components = len(features), len(velocities)
         output = NetworkOutput(
             features.new_empty((faces, 3, 3)), features.new_empty((faces, 3)), features.new_zeros((components, 3))
         )
-        air = None if inputs.wind is None else inputs.wind[0]
-        before = None if inputs.previous is None else inputs.previous[0]
-        on = layout.faces, layout.garment_of_face
-        outside = packed_columns(self.outdoor, self.config.fps, inputs.vertices, before, *on, inputs.materials, air)
         if features.device.type == "cpu" and not (torch.is_grad_enabled() or bfloat16):
             for view in layout.views:
                 self._step(view, view.inputs(features, velocities, outside), features, output)
@@ -181,17 +177,26 @@ class GarmentNetwork(nn.Module):
         newest = context(features, layout.face_component, components)
         return compose(output, newest, residual=self.config.residual)
 
+    def packed_inputs(
+        self, inputs: FrameInputs, layout: RowLayout
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Features [F,H*34], velocities [C,(H-1)*3] and outdoor channels [F,K] of a packed batch; None without any."""
+        air = None if inputs.wind is None else inputs.wind[0]
+        before = None if inputs.previous is None else inputs.previous[0]
+        on = layout.faces, layout.garment_of_face
+        outside = packed_columns(self.outdoor, self.config.fps, inputs.vertices, before, *on, inputs.materials, air)
+        return inputs.features.flatten(1), inputs.velocities.flatten(1), outside
+
     def _step(self, view: PaddedView, rows: RowInputs, features: torch.Tensor, output: NetworkOutput) -> None:
         """Runs the network on a view and writes its steps: what `predict` does by operators, in a launch."""
         said, turn = normalised(self, rows)
         turn = torch.eye(3).expand(len(said.psi), 3, 3) if turn is None else turn
         scale = [self.psi_std, self.singular_value_std, self.psi_mean, self.singular_value_mean]
-        index = view.face_index if view.face_mask is None else torch.where(view.face_mask, view.face_index, -1)
         steps(
             torch.cat([said.psi, said.singular_values], dim=-1),
             torch.cat(scale),
             turn.contiguous(),
-            index,
+            view.index,
             features,
             features.shape[1] - FEATURES + LAYOUT["body_deformation"].start,
             (output.psi, output.singular_values),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +47,16 @@ class PaddedView:
     real_faces: torch.Tensor | None  # int64, indices of True entries of the flattened face_mask; None if it is None
     real_components: torch.Tensor | None  # int64, indices of True entries of the flattened component_mask
     begin: int | None  # first packed face, if the rows are faces that follow each other, without padding
+
+    @cached_property
+    def index(self) -> torch.Tensor:
+        """Packed face of each entry, int64 [R,N]; -1 for padding."""
+        return _or_none(self.face_index, self.face_mask)
+
+    @cached_property
+    def piece(self) -> torch.Tensor:
+        """Packed component of each entry, int64 [R,C]; -1 for padding."""
+        return _or_none(self.component_index, self.component_mask)
 
     def faces(self, packed: torch.Tensor) -> torch.Tensor:
         """Takes values of packed faces to rows, [F,...] -> [R,N,...]."""
@@ -221,6 +232,10 @@ def _view(
         share=torch.tensor([1.0 / min(face_splits, len(garments[g].faces)) for g, _, _ in rows], device=device),
         begin=_begin(face_index),
     )
+
+
+def _or_none(index: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    return index if mask is None else torch.where(mask, index, -1)
 
 
 def _begin(index: np.ndarray) -> int | None:

@@ -1,6 +1,7 @@
 """The network of patches by kernels: the same network as torch's, and always with its newest weights."""
 
 import copy
+import dataclasses
 
 import pytest
 import torch
@@ -11,10 +12,13 @@ import warpgarment as wg
 from warpgarment.kernels.dense import products
 from warpgarment.kernels.features.channels import FACE, FEATURES, INTERACTION
 from warpgarment.nn.config import NetworkConfig
+from warpgarment.nn.inputs import FrameInputs
 from warpgarment.nn.patches import fused
 from warpgarment.nn.patches.layout import garment_patches, patch_layout
 from warpgarment.nn.patches.network import PatchTransformer
 from warpgarment.objects.garment import Garment
+from warpgarment.objects.material import Material
+from warpgarment.objects.pack import PackedGarments
 
 pytestmark = pytest.mark.skipif(not products.available(), reason="this processor has no vectors")
 
@@ -70,6 +74,35 @@ def test_it_is_the_network_of_torch(heading, chosen, monkeypatch):
     for one, other, mask in zip(result, expected, (faces, faces, pieces), strict=True):
         close(one[mask], other[mask], 1e-4 * max(1.0, other[mask].abs().max().item()))
         assert not torch.equal(one[mask], other[mask])  # they are two
+
+
+@pytest.mark.parametrize("outdoor", [(), ("density", "stretch", "shear", "bend", "friction", "wind")])
+@pytest.mark.parametrize("residual", [False, True])
+def test_steps_of_a_batch(outdoor, residual, monkeypatch):
+    """A frame would not move as in training: padding would be a face, or velocities be those of other pieces.
+
+    Beside the same by torch: 1e-4 of outputs around one.
+    """
+    made = network(heading="canonical", outdoor=outdoor, residual=residual)
+    packed = PackedGarments.pack(GARMENTS, torch.device("cpu"))
+    layout, generator = made.layout(GARMENTS, packed), torch.Generator().manual_seed(0)
+    faces, pieces = len(packed.faces), packed.component_offsets[-1]
+    vertices = packed.rest_vertices
+    materials = None
+    if outdoor:
+        materials = torch.rand(len(GARMENTS), len(dataclasses.fields(Material)), generator=generator) + 0.5
+    inputs = FrameInputs(
+        torch.randn(faces, 3, FEATURES, generator=generator), torch.randn(pieces, 2, 3, generator=generator),
+        vertices, vertices, vertices, materials=materials,
+    )  # fmt: skip
+    with torch.no_grad():
+        assert fused.predicts(made, layout)
+        result = made.predict(inputs, layout)
+        monkeypatch.setattr(fused, "predicts", lambda *_: False)
+        monkeypatch.setattr(products, "available", lambda: False)
+        expected = made.predict(inputs, layout)
+    for one, other in zip(result, expected, strict=True):
+        close(one, other, 1e-4 * max(1.0, other.abs().max().item()))
 
 
 def test_factors_of_a_turn():

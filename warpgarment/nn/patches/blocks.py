@@ -86,7 +86,7 @@ def forward(
     rows, count, width = faces.shape
     patches = layout.start.shape[1]
     if fused.fits(network, patches + tokens.shape[1]):
-        return fused.forward(network, faces, tokens, layout, mask)
+        return fused.forward(fused.packed(network), faces, tokens, layout, mask)
     own = list(torch.empty((2, *faces.shape)))
     heard = faces.new_empty((rows, patches, width))
     answer = faces.new_empty((rows, count, network.face_head.out_features))

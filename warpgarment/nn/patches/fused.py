@@ -15,16 +15,21 @@ import numpy as np
 import torch
 from torch import nn
 
+from warpgarment.kernels.deformation.steps import steps
 from warpgarment.kernels.dense import faces as dense
+from warpgarment.kernels.dense import heading as heads
 from warpgarment.kernels.dense import products, tokens
 from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
-from warpgarment.kernels.features.channels import Kind, Layout
+from warpgarment.kernels.features.channels import FEATURES, LAYOUT, Kind, Layout
+from warpgarment.nn.parametrisation import Step
 
 from . import changes
 
 if TYPE_CHECKING:
     from warpgarment.nn.attention import EncoderLayer
     from warpgarment.nn.config import NetworkConfig
+    from warpgarment.nn.inputs import FrameInputs
+    from warpgarment.nn.rows import RowLayout
 
     from .layout import PatchLayout
     from .network import FaceLayer, PatchTransformer
@@ -49,9 +54,10 @@ class Packed(NamedTuple):
     sources: list[Source]  # the parameters and statistics they were made from
     steps: int  # of optimisers until then
     embed: torch.Tensor  # [F,H,K], over the deviations of the features
-    first_factor: torch.Tensor  # of each entry of the matrix that turns features, from `factors`
-    second_factor: torch.Tensor
-    known: torch.Tensor  # [2], one and zero
+    bias: torch.Tensor  # [F]
+    heading: heads.Model
+    step_scale: torch.Tensor  # [24], deviations of psi and sigma, then their means
+    velocity_scale: torch.Tensor  # [6], deviations of the velocities of pieces, then their means
     first: dense.Perceptron
     after: list[dense.Perceptron]  # for faces that hear their neighbours
     alone: list[dense.Perceptron]  # for subsets of faces
@@ -68,11 +74,15 @@ class Packed(NamedTuple):
         return True
 
 
+STATISTICS = (
+    "feature_std",
+    *(f"{name}_{kind}" for name in ("velocity", "psi", "singular_value", "q") for kind in ("std", "mean")),
+)
 _known: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()
 _fitting: WeakKeyDictionary[nn.Module, tuple[NetworkConfig, bool]] = WeakKeyDictionary()
 
 
-LAUNCHED = "dense.tokens", "dense.faces", "dense.turned", "dense.products"
+LAUNCHED = "dense.tokens", "dense.faces", "dense.turned", "dense.heading", "dense.products"
 """Modules of `warpgarment.kernels` with the kernels of the layers, slow ones first."""
 
 
@@ -114,7 +124,7 @@ def _sources(network: PatchTransformer) -> list[Source]:
     """All parameters of a network and the statistics that are part of its weights."""
     places: list[tuple[Place, str]] = [(m._parameters, name) for m in network.modules() for name in m._parameters]
     found = []
-    for place, name in [*places, (network._buffers, "feature_std")]:
+    for place, name in [*places, *((network._buffers, name) for name in STATISTICS)]:
         value = place[name]
         if value is not None:
             found.append(Source(place, name, value, value.data_ptr(), changes.version(value)))
@@ -130,8 +140,16 @@ def _pack(network: PatchTransformer) -> Packed:
         _sources(network),
         changes.optimiser_steps(),
         (weight / network.feature_std).contiguous(),
-        *factors(network.channels),
-        torch.tensor([1.0, 0.0]),
+        network.embed_faces.bias.detach(),
+        heads.Model(
+            *factors(network.channels),
+            torch.cat([network.velocity_std, network.velocity_mean]),
+            network.embed_velocity.weight.detach(),
+            network.embed_velocity.bias.detach(),
+            network.config.heading == "canonical",
+        ),
+        torch.cat([network.psi_std, network.singular_value_std, network.psi_mean, network.singular_value_mean]),
+        torch.cat([network.q_std, network.q_mean]),
         _perceptron(network.before, hears=False),
         [_perceptron(layer, hears=True) for layer in layers],
         [_perceptron(layer, hears=False) for layer in layers],
@@ -216,27 +234,58 @@ def _perceptron(layer: FaceLayer, *, hears: bool) -> dense.Perceptron:
     )
 
 
+def predicts(network: PatchTransformer, layout: RowLayout) -> bool:
+    """Whether `predict` can do this batch."""
+    views = layout.views
+    return all(fits(network, view.weights.start.shape[1] + view.piece.shape[1]) for view in views)
+
+
+def predict(network: PatchTransformer, inputs: FrameInputs, layout: RowLayout) -> Step:
+    """`GarmentNetwork.predict` on a CPU without gradients, by launches that have all operators in them."""
+    features, velocities, outside = network.packed_inputs(inputs, layout)
+    read, weights, residual = network.read(features), packed(network), network.config.residual
+    newest = features.shape[1] - FEATURES
+    columns = (newest + LAYOUT[name].start for name in ("deformation_gradient", "body_velocity", "body_deformation"))
+    gradient, body_velocity, body = columns
+    step = Step(
+        *(features.new_empty(shape) for shape in ((len(features), 3, 3), (len(features), 3), (len(velocities), 3)))
+    )
+    for view in layout.views:
+        rows = heads.Rows(view.index, view.piece, layout.face_component)
+        found = heads.heading(features, velocities, rows, weights.heading, gradient, body_velocity)
+        faces = dense.embed(read, rows.face, *turned(weights.embed, network.feature_mean, found.turns), weights.bias)
+        if network.outdoor.width:
+            outdoor = None if outside is None else network.known(view.faces(outside))
+            if outdoor is not None:
+                outdoor = outdoor @ network.outdoor.turn(found.turn).mT
+            faces = network.with_outdoor(faces, outdoor, None, embedded=True)
+        mask = network.key_mask(view.weights, view.component_mask, found.tokens)
+        answer, velocity = forward(weights, faces, found.tokens, view.weights, mask)
+        written = step.psi, step.singular_values
+        steps(answer, weights.step_scale, found.turn, rows.face, features, body, written, residual=residual)
+        heads.velocities(velocity, found, rows, weights.velocity_scale, step.velocity, residual=residual)
+    return step
+
+
 def embedded(network: PatchTransformer, features: torch.Tensor, turn: torch.Tensor | None) -> torch.Tensor:
     """`PatchTransformer.embedded` of features [R,N,H*K] that hold the channels the network reads."""
     weights = packed(network)
     turn = torch.eye(3)[None] if turn is None else turn
-    entries = torch.cat([turn.flatten(1), weights.known.expand(len(turn), -1)], dim=1)
-    turns = (entries[:, weights.first_factor] * entries[:, weights.second_factor]).unflatten(
-        1, (network.channels.width, -1)
-    )
-    centre, weight = turned(weights.embed, network.feature_mean, turns)
-    return dense.embed(features, centre, weight, network.embed_faces.bias.detach())
+    entries = torch.cat([turn.flatten(1), torch.tensor([1.0, 0.0]).expand(len(turn), -1)], dim=1)
+    turns = entries[:, weights.heading.first] * entries[:, weights.heading.second]
+    index = torch.arange(features.shape[0] * features.shape[1]).reshape(features.shape[:2])
+    centre_and_weight = turned(weights.embed, network.feature_mean, turns)
+    return dense.embed(features.flatten(0, 1), index, *centre_and_weight, weights.bias)
 
 
 def forward(
-    network: PatchTransformer,
+    weights: Packed,
     faces: torch.Tensor,
     given: torch.Tensor,
     layout: PatchLayout,
     mask: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The network from embedded faces to the outputs of its heads; arguments and result as of `blocks.forward`."""
-    weights = packed(network)
     dense.first(faces, weights.first)
     pools = tokens.Pools(layout.start, layout.member, layout.member_weight, layout.pieces, layout.weights)
     real = None if mask is None else mask.flatten(1)

@@ -23,8 +23,10 @@ from torch import nn
 
 from warpgarment.nn.attention import ACTIVATIONS, one_by_one
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.inputs import NormalisedOutput, RowInputs
+from warpgarment.nn.inputs import FrameInputs, NormalisedOutput, RowInputs, VertexStep
 from warpgarment.nn.network import GarmentNetwork
+from warpgarment.nn.parametrisation import Step
+from warpgarment.nn.rows import RowLayout
 
 from . import blocks, first, fused, trained
 from .bags import Sums, sums_of
@@ -140,6 +142,12 @@ class PatchTransformer(GarmentNetwork):
         config = self.config
         return FaceLayer(config.face_embedding, config.face_feed_forward, config.activation, hears)
 
+    def predict(self, inputs: FrameInputs, layout: RowLayout, *, bfloat16: bool = False) -> Step | VertexStep:
+        """As in `GarmentNetwork`; on a CPU without gradients by few launches."""
+        if not bfloat16 and blocks.by_blocks(inputs.features) and fused.predicts(self, layout):
+            return fused.predict(self, inputs, layout)
+        return super().predict(inputs, layout, bfloat16=bfloat16)
+
     def embedded(
         self, face_features: torch.Tensor, turn: torch.Tensor | None, face_mask: torch.Tensor | None
     ) -> torch.Tensor:
@@ -208,7 +216,7 @@ class PatchTransformer(GarmentNetwork):
         batch, count = faces.shape[:2]
         patches = weights.start.shape[1]
         if blocks.by_blocks(faces):
-            mask = self._key_mask(weights, velocity_mask, tokens)
+            mask = self.key_mask(weights, velocity_mask, tokens)
             answer, velocity = blocks.forward(self, faces.contiguous(), tokens, weights, mask)
             psi, singular_values = answer.split([9, 3], dim=-1)
             return NormalisedOutput(psi, singular_values, velocity)
@@ -220,7 +228,7 @@ class PatchTransformer(GarmentNetwork):
         kind = faces.device.type
         half = torch.is_autocast_enabled(kind)
         geodesic = weights.weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
-        mask = self._key_mask(weights, velocity_mask, mean)
+        mask = self.key_mask(weights, velocity_mask, mean)
         before = tokens
         for layer in self.layers:
             tokens = layer(tokens, geodesic, mask)
@@ -238,7 +246,7 @@ class PatchTransformer(GarmentNetwork):
             )
 
     @staticmethod
-    def _key_mask(weights: PatchLayout, velocity_mask: torch.Tensor | None, v: torch.Tensor) -> torch.Tensor | None:
+    def key_mask(weights: PatchLayout, velocity_mask: torch.Tensor | None, v: torch.Tensor) -> torch.Tensor | None:
         """True where a token is real, shape [B,1,1,P+C]; None where all are."""
         if weights.mask is None and velocity_mask is None:
             return None
