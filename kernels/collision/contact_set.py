@@ -127,7 +127,7 @@ def contact_gap(
     vertices: wp.array[wp.vec3],
     normal: wp.array[wp.vec3d],
     anchor: wp.array[wp.vec3d],
-    distance: wp.float64,
+    distance: wp.array[wp.float64],  # of each contact, or one for all
     # Out:
     gap: wp.array[wp.float64],
 ):
@@ -136,5 +136,5 @@ def contact_gap(
     n = normal[i]
     c = wp.float64(0.0)
     if wp.dot(n, n) > c:
-        c = distance - wp.dot(n, wp.vec3d(vertices[i]) - anchor[i])
+        c = distance[wp.min(i, distance.shape[0] - 1)] - wp.dot(n, wp.vec3d(vertices[i]) - anchor[i])
     gap[i] = c

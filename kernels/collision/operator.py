@@ -101,17 +101,16 @@ def _solve(
     return increment, force, report, error
 
 
-@operator("warpgarment::collision_solve")
-def collision_solve(
+def minimised(
     vertices: torch.Tensor,
     normal: torch.Tensor,
     anchor: torch.Tensor,
-    distance: float,
+    distance: torch.Tensor,
     tolerance: torch.Tensor,
-    model: list[torch.Tensor],
+    model: Model,
     max_iterations: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The minimiser of eq. 5 for given contacts: positions [m], and iterations and error [m] of each component."""
+    """The operator `collision_solve` as a function, without gradients, and without what a call of an operator costs."""
     vertices, normal, anchor = vertices.contiguous(), normal.contiguous(), anchor.contiguous()
     gap = allocate((len(vertices),), torch.float64, vertices.device)
     with torch_stream(vertices.device) as device:
@@ -122,13 +121,30 @@ def collision_solve(
                 as_argument(vertices, wp.vec3),
                 as_argument(normal, wp.vec3d),
                 as_argument(anchor, wp.vec3d),
-                float(distance),
+                as_argument(distance, wp.float64),
                 as_argument(gap, wp.float64),
             ],
             device,
         )
-    increment, _, report, error = _solve(unpack(model, Model), normal, gap, tolerance, 0.0, max_iterations)
+    increment, _, report, error = _solve(model, normal, gap, tolerance, 0.0, max_iterations)
     return (vertices.double() + increment).to(torch.float32), report, error
+
+
+@operator("warpgarment::collision_solve")
+def collision_solve(
+    vertices: torch.Tensor,
+    normal: torch.Tensor,
+    anchor: torch.Tensor,
+    distance: torch.Tensor,
+    tolerance: torch.Tensor,
+    model: list[torch.Tensor],
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The minimiser of eq. 5 for given contacts: positions [m], and iterations and error [m] of each component.
+
+    `distance` is float64, of each contact or one for all.
+    """
+    return minimised(vertices, normal, anchor, distance, tolerance, unpack(model, Model), max_iterations)
 
 
 @collision_solve.register_fake
@@ -136,7 +152,7 @@ def _(
     vertices: torch.Tensor,
     normal: torch.Tensor,
     anchor: torch.Tensor,
-    distance: float,
+    distance: torch.Tensor,
     tolerance: torch.Tensor,
     model: list[torch.Tensor],
     max_iterations: int,

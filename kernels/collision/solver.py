@@ -47,7 +47,7 @@ from .body_contacts import BodyContacts
 from .compliance import Compliance
 from .compliance_rows import Rows
 from .contact_set import ContactFrame, Contacts, one_for_each_vertex
-from .operator import Model
+from .operator import Model, minimised
 
 TOLERANCE = 2e-6
 """Error of a solve in the energy norm [m].
@@ -112,7 +112,9 @@ class CollisionSolver:
         factors = Factor.build(base.tocsr(), system, explicit=False, budget=budget, skip=dense.base.cpu().numpy() >= 0)
         rows = Rows.build(system, factors, row_budget)
         owner = torch.from_numpy(vertex_component).to(device)
-        self._model = pack(Model(system, dense, factors, rows, owner, one_core))
+        self._parts = Model(system, dense, factors, rows, owner, one_core)
+        self._model = pack(self._parts)
+        self._limits: dict[float, torch.Tensor] = {}
         self._progress = Progress("CollisionSolver")
         self._normal: torch.Tensor | None = None  # of the contacts of the last refinement
         self.vertex_count = vertex_count
@@ -228,18 +230,24 @@ class CollisionSolver:
         """The tolerance of each component, float64 [C]."""
         if not tolerance > 0:
             raise ValueError(f"tolerance must be positive, got {tolerance}")
-        return torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
+        if tolerance not in self._limits:
+            limit = torch.full((self.component_count,), tolerance, dtype=torch.float64, device=self.device)
+            self._limits = {tolerance: limit}
+        return self._limits[tolerance]
 
     def _solve(self, vertices: torch.Tensor, contacts: Contacts, limit: torch.Tensor, *, first: bool) -> torch.Tensor:
         """One solve; the first one of a refinement resets the report."""
         normal, anchor, distance, *_ = contacts
-        if isinstance(distance, torch.Tensor):  # n.(V - U) - d = n.(V - (U + d n)), so the operator's distance is zero
-            anchor, distance = anchor + distance[:, None] * normal, 0.0
+        if not isinstance(distance, torch.Tensor):
+            distance = torch.full((1,), distance, dtype=torch.float64, device=self.device)
+        given = normal, anchor, distance.double(), limit
         if first:
             self._normal = normal
-        vertices, report, error = torch.ops.warpgarment.collision_solve(
-            vertices, normal, anchor, distance, limit, self._model, self.max_iterations
-        )
+        if torch.compiler.is_compiling() or (vertices.requires_grad and torch.is_grad_enabled()):
+            solved = torch.ops.warpgarment.collision_solve(vertices, *given, self._model, self.max_iterations)
+        else:
+            solved = minimised(vertices, *given, self._parts, self.max_iterations)
+        vertices, report, error = solved
         self._progress.record(report, error, self.max_iterations, add=not first)
         return vertices
 

@@ -92,6 +92,8 @@ class Progress:
     def _warn(self, report: torch.Tensor, error: torch.Tensor) -> None:
         if self._warned or not len(report):
             return
+        if report.device.type == "cpu" and report.numpy().min() >= 0:
+            return
         stopped = report < 0
         if bool(stopped.any()):
             self.warn_if_stopped(int(stopped.sum()), len(report), float(error[stopped].max()))

@@ -46,25 +46,33 @@ class Matrix(NamedTuple):
     factor: Factor
 
 
-def _views(model: list[torch.Tensor]) -> dict[str, object]:
-    tensors = _named(model)
-    return {name: as_argument(tensors[name], dtype) for name, dtype in MODEL if dtype is not None}
+class Model(NamedTuple):
+    """The tensors of a solver, as functions and as kernels take them."""
 
+    tensors: dict[str, torch.Tensor]  # by the names of `MODEL`
+    views: dict[str, object]  # arguments of launches, which are valid as long as the tensors
+    start_rows: list[object]
+    matrix: Matrix
 
-def _start_rows(model: list[torch.Tensor]) -> list[object]:
-    system = matrix_of(model).system
-    return [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32)]
+    @classmethod
+    def of(cls, listed: list[torch.Tensor]) -> Model:
+        """From the list that the operators take."""
+        tensors, matrix = _named(listed), matrix_of(listed)
+        views = {name: as_argument(tensors[name], dtype) for name, dtype in MODEL if dtype is not None}
+        views["corner_faces"] = as_argument(tensors["faces"], wp.vec3i)
+        views["corner_cotangents"] = as_argument(tensors["half_cotangent"], wp.vec3d)
+        system = matrix.system
+        return cls(tensors, views, [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32)], matrix)
 
 
 def _solve(
-    model: list[torch.Tensor], rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
+    model: Model, rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Solves (L + W) D = g: directly where there is a factor, otherwise by conjugate gradients.
 
     Returns as `conjugate_gradients.solve` does: D [m], float64 [V,3], iterations and error of each component.
     """
-    system, factor = matrix_of(model)
-    tensors = _named(model)
+    (system, factor), tensors = model.matrix, model.tensors
     if factor.unfactored:
         load = factor.without(rhs, tensors["vertex_component"])
         solution, report, error = conjugate_gradients.solve(
@@ -84,6 +92,66 @@ def _named(model: list[torch.Tensor]) -> dict[str, torch.Tensor]:
 def matrix_of(model: list[torch.Tensor]) -> Matrix:
     """The matrix, taken from the tensors of a solver."""
     return unpack(model[len(MODEL) :], Matrix)
+
+
+def solved(
+    phi: torch.Tensor,
+    mean: torch.Tensor,
+    pin_target: torch.Tensor,
+    initial: torch.Tensor,
+    model: Model,
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The operator `poisson_solve` as a function, without gradients, and without what a call of an operator costs."""
+    tensors, m, count = model.tensors, model.views, len(mean)
+    phi, mean, pin_target = phi.contiguous(), mean.contiguous(), pin_target.contiguous()
+    guess = initial.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
+    if len(pin_target):  # a pinned component starts with the mean translation of its pins
+        pins = tensors["pins"]
+        offset = torch.zeros((count, 3), dtype=torch.float64, device=phi.device)
+        offset.index_add_(0, tensors["vertex_component"][pins], pin_target.double() - guess[pins])
+        guess += (offset / tensors["pins_in_component"].clamp(min=1.0))[tensors["vertex_component"]]
+    rhs = allocate(guess.shape, torch.float64, phi.device)
+    vertices = allocate(guess.shape, torch.float32, phi.device)
+    if count == 0:
+        return vertices, vertices.new_empty(0, dtype=torch.int32), vertices.new_empty(0, dtype=torch.float64)
+    with torch_stream(phi.device) as device:
+        launch_rows(
+            right_hand_side,
+            len(guess),
+            inputs=[
+                m["corner_faces"],
+                m["corner_cotangents"],
+                m["corner_start"],
+                m["corners"],
+                m["corner_edge"],
+                m["pin_of_vertex"],
+                m["pin_stiffness"],
+                as_argument(phi, wp.mat33),
+                as_argument(guess, wp.vec3d),
+                as_argument(pin_target, wp.vec3),
+                as_argument(rhs, wp.vec3d),
+            ],
+            outputs=[],
+            device=device,
+        )
+        increment, report, error = _solve(model, rhs, tensors["tolerance"], 0.0, max_iterations)
+        launch_tiled(
+            place,
+            count,
+            [
+                *model.start_rows,
+                m["kind"],
+                m["centroid_weight"],
+                as_argument(guess, wp.vec3d),
+                as_argument(increment, wp.vec3d),
+                as_argument(mean, wp.vec3),
+                as_argument(vertices, wp.vec3),
+            ],
+            device,
+            block_dim=block_dim(phi.device, len(guess), count),
+        )
+    return vertices, report, error
 
 
 @operator("warpgarment::poisson_solve")
@@ -108,55 +176,7 @@ def poisson_solve(
     Returns:
         Positions [m], float32 [V,3]; iterations, int32 [C]; estimated error in the energy norm [m], float64 [C].
     """
-    tensors, m, count = _named(model), _views(model), len(mean)
-    phi, mean, pin_target = phi.contiguous(), mean.contiguous(), pin_target.contiguous()
-    guess = initial.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
-    if len(pin_target):  # a pinned component starts with the mean translation of its pins
-        pins = tensors["pins"]
-        offset = torch.zeros((count, 3), dtype=torch.float64, device=phi.device)
-        offset.index_add_(0, tensors["vertex_component"][pins], pin_target.double() - guess[pins])
-        guess += (offset / tensors["pins_in_component"].clamp(min=1.0))[tensors["vertex_component"]]
-    rhs = allocate(guess.shape, torch.float64, phi.device)
-    vertices = allocate(guess.shape, torch.float32, phi.device)
-    if count == 0:
-        return vertices, vertices.new_empty(0, dtype=torch.int32), vertices.new_empty(0, dtype=torch.float64)
-    with torch_stream(phi.device) as device:
-        launch_rows(
-            right_hand_side,
-            len(guess),
-            inputs=[
-                as_argument(tensors["faces"], wp.vec3i),
-                as_argument(tensors["half_cotangent"], wp.vec3d),
-                m["corner_start"],
-                m["corners"],
-                m["corner_edge"],
-                m["pin_of_vertex"],
-                m["pin_stiffness"],
-                as_argument(phi, wp.mat33),
-                as_argument(guess, wp.vec3d),
-                as_argument(pin_target, wp.vec3),
-                as_argument(rhs, wp.vec3d),
-            ],
-            outputs=[],
-            device=device,
-        )
-        increment, report, error = _solve(model, rhs, tensors["tolerance"], 0.0, max_iterations)
-        launch_tiled(
-            place,
-            count,
-            [
-                *_start_rows(model),
-                m["kind"],
-                m["centroid_weight"],
-                as_argument(guess, wp.vec3d),
-                as_argument(increment, wp.vec3d),
-                as_argument(mean, wp.vec3),
-                as_argument(vertices, wp.vec3),
-            ],
-            device,
-            block_dim=block_dim(phi.device, len(guess), count),
-        )
-    return vertices, report, error
+    return solved(phi, mean, pin_target, initial, Model.of(model), max_iterations)
 
 
 @poisson_solve.register_fake
@@ -181,7 +201,8 @@ def poisson_solve_backward(
     grad_vertices: torch.Tensor, mean: torch.Tensor, model: list[torch.Tensor], max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Gradients with respect to phi, mean and pin_target: one solve with the same matrix."""
-    tensors, m, count = _named(model), _views(model), len(mean)
+    parts = Model.of(model)
+    tensors, m, count = parts.tensors, parts.views, len(mean)
     grad_vertices = grad_vertices.contiguous()
     rhs = allocate(grad_vertices.shape, torch.float64, mean.device)
     grad_mean = allocate(mean.shape, torch.float32, mean.device)
@@ -193,7 +214,7 @@ def poisson_solve_backward(
             place_adjoint,
             dim=[count],
             inputs=[
-                *_start_rows(model),
+                *parts.start_rows,
                 m["kind"],
                 m["centroid_weight"],
                 as_argument(grad_vertices, wp.vec3),
@@ -204,7 +225,7 @@ def poisson_solve_backward(
             device=device,
         )
         exactly = torch.zeros_like(tensors["tolerance"])
-        adjoint, _, _ = _solve(model, rhs, exactly, ADJOINT_TOLERANCE, max_iterations)
+        adjoint, _, _ = _solve(parts, rhs, exactly, ADJOINT_TOLERANCE, max_iterations)
         wp.launch(
             phi_adjoint,
             dim=len(grad_phi),

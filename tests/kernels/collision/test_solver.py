@@ -253,8 +253,8 @@ def test_operator_passes_opcheck():
     vertices = torch.tensor(rest.vertices, requires_grad=True)
     query = bodies.query(vertices)
     normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
-    limit = torch.full((1,), 1e-6, dtype=torch.float64)
-    arguments = (vertices, normals, closest, EPSILON, limit, solver_for(rest)._model, 100)
+    limit, distance = (torch.full((1,), value, dtype=torch.float64) for value in (1e-6, EPSILON))
+    arguments = (vertices, normals, closest, distance, limit, solver_for(rest)._model, 100)
     torch.library.opcheck(torch.ops.warpgarment.collision_solve, arguments)
 
 
@@ -265,11 +265,11 @@ def test_many_lanes_give_the_same_result(monkeypatch, solver):
     solver, vertices = solver_for(rest, **SOLVERS[solver]), torch.tensor(rest.vertices, requires_grad=True)
     query = bodies.query(vertices)
     normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
-    limit = torch.full((1,), 1e-6, dtype=torch.float64)
+    limit, distance = (torch.full((1,), value, dtype=torch.float64) for value in (1e-6, EPSILON))
 
     def solve():
         model = solver._model
-        result, _, _ = torch.ops.warpgarment.collision_solve(vertices, normals, closest, EPSILON, limit, model, 500)
+        result, _, _ = torch.ops.warpgarment.collision_solve(vertices, normals, closest, distance, limit, model, 500)
         return result, *torch.autograd.grad((result**3).sum(), vertices)
 
     one = solve()
@@ -298,13 +298,13 @@ def test_not_a_number_stays_visible():
     vertices[7, 1] = torch.nan
     result = solver_for(rest).refine(vertices, body_of(ellipsoid()))
     assert result[7, 1].isnan()
-    limit, model = torch.full((1,), 1e-6, dtype=torch.float64), solver_for(rest)._model
+    limit, distance = (torch.full((1,), value, dtype=torch.float64) for value in (1e-6, EPSILON))
     normals = torch.zeros(len(vertices), 3, dtype=torch.float64)
     normals[7, 0] = 1.0
     for options in SOLVERS.values():
         model = solver_for(rest, **options)._model
         broken = torch.ops.warpgarment.collision_solve(
-            vertices + torch.nan, normals, 0.0 * normals, EPSILON, limit, model, 50
+            vertices + torch.nan, normals, 0.0 * normals, distance, limit, model, 50
         )
         assert broken[0].isnan().all()
 

@@ -121,13 +121,16 @@ class Contact:
                     pending = finite & pending & (depth > SHALLOW)
                     if self.early_exit and not pending.any():
                         return vertices, finite, depth, report
-                    on_body = torch.where(pending[owner], self._body_of_vertex, -1)
+                    if not (self.early_exit and pending.all()):
+                        on_body = torch.where(pending[owner], self._body_of_vertex, -1)
                     epsilon = distance_to_keep(epsilon, inside.missing, vertices, bodies, on_body)
                 assert self.solver is not None
                 frame = ContactFrame(bodies, on_body, self._packed.garment_of_vertex, epsilon, origin)
                 refined = self.solver.solve(vertices, self._contacts(vertices, frame))
-                report = _together(report, self.solver.summary())
-                refined = torch.where(pending[owner][:, None], refined, vertices)
+                summary = self.solver.summary()
+                report = _together(report, summary) if number else summary
+                if not (self.early_exit and pending.all()):
+                    refined = torch.where(pending[owner][:, None], refined, vertices)
                 vertices, finite = keep_finite(self._packed, refined, vertices, finite)
             if self._sources and self._passes:
                 vertices = self._out(vertices, bodies, pending, origin)
