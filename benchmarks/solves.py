@@ -82,10 +82,11 @@ def collisions(scene: Dressed, bodies: BodyMeshes, device: torch.device, seconds
     query = bodies.query(pressed, within=EPSILON)
     normal, closest, *_ = contacts(pressed, query.distance, query.face, bodies, EPSILON)
     limit = torch.full((refiner.component_count,), TOLERANCE, dtype=torch.float64, device=device)
+    distance = torch.full((1,), EPSILON, dtype=torch.float64, device=device)
 
     def solve() -> torch.Tensor:
         operator = torch.ops.warpgarment.collision_solve
-        return operator(pressed, normal, closest, EPSILON, limit, refiner._model, refiner.max_iterations)[0]
+        return operator(pressed, normal, closest, distance, limit, refiner._model, refiner.max_iterations)[0]
 
     host, normals = scene.pressed.astype(np.float64), normal.cpu().numpy()
     touching = np.flatnonzero((normals != 0.0).any(axis=1))

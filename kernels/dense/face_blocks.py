@@ -21,26 +21,27 @@ PLACE = """
     source(
         PLACE
         + """
-    alignas(64) float c[32 * 256];
+    alignas(64) float c[32 * 256], line[256 + 1024];
     LEFT(left, 32 * 256);
-    const int depth = (columns + 31) / 32;
+    const int columns = frames.shape[0] * channels, depth = (columns + 31) / 32;
     const float* middle = centre.data + (long)(row % packs) * 32 * depth;
     const float* w = weight.data + (long)(row % packs) * width * depth * 32;
     for (int i = 0; i < 32; i++)
         for (int j = 0; j < width; j += 16) Vector::store(c + i * width + j, Vector::load(bias.data + j));
     Matrix::begin();
     for (int k = 0; k < depth; k += 8) {
-        const int steps = depth - k < 8 ? depth - k : 8;
-        for (int i = 0; i < 32; i++)
-            for (int j = 0; j < 32 * steps; j += 16) {
-                const long face = i < many ? index.data[at + i] : -1;
-                if (face < 0) {
-                    left.put(i * 256 + j, v16{});
-                    continue;
-                }
-                const v16 x = Vector::load(features.data + face * pitch + 32 * k + j, columns - 32 * k - j);
-                left.put(i * 256 + j, x - Vector::load(middle + 32 * k + j));
-            }
+        const int steps = depth - k < 8 ? depth - k : 8, begin = 32 * k, end = begin + 32 * steps;
+        for (int i = 0; i < 32; i++) {
+            const long face = i < many ? index.data[at + i] : -1;
+            for (int h = begin / channels; h < frames.shape[0] && h * channels < end; h++)
+                if (face >= 0)
+                    __builtin_memcpy(line + h * channels - begin / channels * channels,
+                                     (const float*)frames.data[h] + face * pitch, 4l * channels);
+            const float* to = line + begin % channels;  // at column `begin`
+            for (int j = 0; j < 32 * steps; j += 16)
+                left.put(i * 256 + j, face < 0 ? v16{} : Vector::load(to + j, columns - begin - j)
+                                                             - Vector::load(middle + begin + j));
+        }
         Matrix::product(left, 256, w, k, steps, depth, width, c, width);
     }
     Matrix::end();
@@ -51,12 +52,12 @@ PLACE = """
 def embed_block(
     t: int,
     count: int,
-    columns: int,
+    channels: int,
     pitch: int,
     width: int,
     packs: int,
     index: wp.array[wp.int64],
-    features: wp.array[wp.float32],
+    frames: wp.array[wp.int64],
     centre: wp.array[wp.float32],
     weight: wp.array[wp.float32],
     bias: wp.array[wp.float32],

@@ -14,13 +14,14 @@ rows are padded to N faces. Those that describe garments may have one row, which
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import launch_rows, rows_in_memory, torch_stream
+from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .face_blocks import embed_block, first_block, head_block, hear_block, spread_block
@@ -36,7 +37,7 @@ SHARES, SIDES = 4, 3  # patches of a face, and its neighbours
 def embed_kernel(
     from_row: wp.int32,
     count: wp.int32,
-    columns: wp.int32,
+    channels: wp.int32,
     pitch: wp.int32,
     width: wp.int32,
     packs: wp.int32,
@@ -46,11 +47,11 @@ def embed_kernel(
     bias: wp.array[wp.float32],
     # In:
     index: wp.array[wp.int64],
-    features: wp.array[wp.float32],
+    frames: wp.array[wp.int64],
     # Out:
     result: wp.array[wp.float32],
 ):
-    embed_block(from_row + wp.tid(), count, columns, pitch, width, packs, index, features, centre, weight, bias, result)
+    embed_block(from_row + wp.tid(), count, channels, pitch, width, packs, index, frames, centre, weight, bias, result)
 
 
 @wp.kernel(enable_backward=False)
@@ -181,13 +182,13 @@ def _launch(kernel: wp.Kernel, faces: torch.Tensor, inputs: list[object], output
 
 
 def embed(
-    features: torch.Tensor, index: torch.Tensor, centre: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
+    frames: Sequence[torch.Tensor], index: torch.Tensor, centre: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
 ) -> torch.Tensor:
     """The first layer.
 
     Args:
-        features: Features of all frames of packed faces, shape [M,I].
-        index: Which of them the faces of each row are, int64 [R,N]; -1 for padding, which is embedded as zeros.
+        frames: Features of packed faces in H frames, shape [M,K] each; side by side they are the I inputs.
+        index: Which faces are those of each row, int64 [R,N]; -1 for padding, which is embedded as zeros.
         centre: What is subtracted from them, from `turned.turned`, shape [R,I'] or [1,I'].
         weight: Packed weights of the same rows.
         bias: Biases, shape [F].
@@ -195,10 +196,13 @@ def embed(
     Returns:
         Embedded faces, shape [R,N,F].
     """
-    flat, pitch = rows_in_memory(features)
-    result = allocate((*index.shape, len(bias)), features.dtype, features.device)
-    sizes = [features.shape[1], pitch, len(bias), len(weight)]
-    given = [argument(values) for values in (centre, weight, bias, index, flat)]
+    pitch, channels = frames[-1].stride(0), frames[-1].shape[1]
+    if any(frame.stride() != (pitch, 1) for frame in frames):
+        frames, pitch = [frame.contiguous() for frame in frames], channels
+    places = torch.tensor([frame.data_ptr() for frame in frames])
+    result = allocate((*index.shape, len(bias)), torch.float32, index.device)
+    sizes = [channels, pitch, len(bias), len(weight)]
+    given = [argument(values) for values in (centre, weight, bias, index, places)]
     _launch(embed_kernel, index, [*sizes, *given], [result])
     return result
 

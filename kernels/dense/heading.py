@@ -187,11 +187,11 @@ def heading(
     """The heading of each row and what depends on it.
 
     Args:
-        features: Features of the packed faces, of all frames, shape [F,*].
+        features: Features of the packed faces in the newest frame, shape [F,K].
         velocity: Past velocities of the packed pieces [m/frame], shape [C,3*(H-1)].
         rows: The rows.
         model: The network's constants.
-        gradient: Column at which the deformation gradients of the newest frame begin.
+        gradient: Column at which the deformation gradients begin.
         body_velocity: The same of the velocities of the body.
     """
     count, pieces = rows.face.shape[1], rows.piece.shape[1]

@@ -7,6 +7,7 @@ outwards, and a data set checked, without them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,23 +16,23 @@ import scipy.sparse.csgraph
 
 
 class Caps(NamedTuple):
-    """Triangles that close the holes of a packed batch of bodies."""
+    """Triangles that close the holes of a body, or of a packed batch of bodies."""
 
     triangles: np.ndarray
-    """Packed vertex indices of the caps, loop by loop, int32 [K, 3]; the first corner is the fan's centre."""
+    """Vertex indices of the caps, packed ones for a batch, loop by loop, int32 [K, 3]; the first corner is the fan's
+    centre."""
     loops: np.ndarray
     """Index at which the caps of each loop begin, and K, int32 [L + 1]."""
     bodies: np.ndarray
     """Index at which the loops of each body begin, and L, int32 [B + 1]."""
 
 
-def caps_of(faces: np.ndarray, vertex_count: int, vertex_starts: list[int]) -> Caps:
-    """Fans that close bodies; closed bodies get none.
+def caps_of(faces: np.ndarray, vertex_count: int) -> Caps:
+    """Fans that close a body; a closed body gets none.
 
     Args:
-        faces: Packed vertex indices, integers [G, 3], in any orientation; any number of faces may share an edge.
+        faces: Vertex indices, integers [G, 3], in any orientation; any number of faces may share an edge.
         vertex_count: Number of vertices U.
-        vertex_starts: Index at which the vertices of each body begin, and U, [B + 1].
     """
     faces = faces.astype(np.int64)
     start, end = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
@@ -50,10 +51,21 @@ def caps_of(faces: np.ndarray, vertex_count: int, vertex_starts: list[int]) -> C
     triangles = np.stack([centre[loop_of_edge], end, start], axis=1)  # the edge in the opposite direction
     triangles = triangles[(triangles[:, 0] != triangles[:, 1]) & (triangles[:, 0] != triangles[:, 2])]
     triangles = triangles[np.argsort(triangles[:, 0], kind="stable")]
-    centres, first = np.unique(triangles[:, 0], return_index=True)
+    first = np.unique(triangles[:, 0], return_index=True)[1]
     loops = np.append(first, len(triangles))
-    return Caps(
-        triangles.astype(np.int32).reshape(-1, 3),
-        loops.astype(np.int32),
-        np.searchsorted(centres, vertex_starts).astype(np.int32),
-    )
+    bodies = np.array([0, len(first)], np.int32)
+    return Caps(triangles.astype(np.int32).reshape(-1, 3), loops.astype(np.int32), bodies)
+
+
+def joined(caps: Sequence[Caps], vertex_starts: Sequence[int]) -> Caps:
+    """The caps of a packed batch.
+
+    Args:
+        caps: Those of each of its B bodies, alone.
+        vertex_starts: Index at which the vertices of each body begin, [B] or more.
+    """
+    ends = np.append(0, np.cumsum([len(each.triangles) for each in caps])).astype(np.int32)
+    loops = [each.loops[:-1] + end for each, end in zip(caps, ends, strict=False)]
+    triangles = [each.triangles + np.int32(start) for each, start in zip(caps, vertex_starts, strict=False)]
+    bodies = np.append(0, np.cumsum([len(each) for each in loops])).astype(np.int32)
+    return Caps(np.concatenate(triangles), np.append(np.concatenate(loops), ends[-1:]), bodies)

@@ -12,12 +12,13 @@ from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 
 from warpgarment.kernels import kept
 from warpgarment.kernels.launch import as_warp, expect, launch, torch_stream
-from warpgarment.kernels.mesh.caps import caps_of
+from warpgarment.kernels.mesh.caps import caps_of, joined
 
 from . import inside, nearest_face
 from .closest import Bodies, query_bodies
@@ -50,7 +51,7 @@ class BodyMeshes:
 
     Args:
         vertices: Positions [m], float32 [U, 3]; they are copied.
-        faces: Packed (global) vertex indices, int32 [G, 3].
+        faces: Packed (global) vertex indices, int32 [G, 3]; they are kept.
         vertex_offsets: Index at which the vertices of each body begin, and U, integers [B + 1]; None for one body.
         face_offsets: Index at which the faces of each body begin, and G, integers [B + 1]; None for one body.
         wide: Whether nearest faces and rays are searched in trees eight wide, which works on a CPU only, or in Warp's;
@@ -79,26 +80,28 @@ class BodyMeshes:
         face_starts = _offsets("face_offsets", face_offsets, len(faces))
         if len(starts) != len(face_starts):
             raise ValueError(f"vertex_offsets names {len(starts) - 1} bodies, face_offsets {len(face_starts) - 1}")
-        first_vertex = _check(vertices, faces, starts, face_starts)
+        _check(vertices, faces, starts, face_starts)
 
         self.count = len(starts) - 1
         self._vertices = vertices.detach().clone(memory_format=torch.contiguous_format)
-        self._faces = faces.detach().clone(memory_format=torch.contiguous_format)
-        local = self._faces - first_vertex[:, None]
-        host = self._faces.cpu().numpy()
-        topology = host, len(vertices), tuple(starts), tuple(face_starts)
-        caps = kept.of("caps", topology, partial(caps_of, host, len(vertices), starts))
-        rings = kept.of("rings", topology, partial(nearest_face.rings_of, host, face_starts))
+        self._faces = faces.detach().contiguous()
+        first, parts = _topologies(self._faces.cpu().numpy(), starts, face_starts)
+        caps_of_part, rings, indices = {}, {}, {}
+        for b, (part, count) in parts.items():
+            caps_of_part[b] = kept.of("caps", (part, count), partial(caps_of, part, count))
+            rings[b] = kept.of("rings", (part,), partial(nearest_face.rings_of, part))
+            indices[b] = torch.from_numpy(part).flatten().to(vertices.device)
+        caps = joined([caps_of_part[b] for b in first], starts)
+        ring_starts = dict(zip(rings, np.cumsum([0, *map(len, rings.values())]).tolist(), strict=False))
         many = [int(caps.loops[b] - caps.loops[a]) > inside.MOST_CAPS for a, b in pairwise(caps.bodies.tolist())]
         self._meshes: list[wp.Mesh] = []
         with torch_stream(vertices.device):
             for b in range(self.count):
                 points = self._vertices[starts[b] : starts[b + 1]]
-                indices = local[face_starts[b] : face_starts[b + 1]].reshape(-1)
                 self._meshes.append(
                     wp.Mesh(
                         as_warp(points, wp.vec3),
-                        as_warp(indices, wp.int32),
+                        as_warp(indices[first[b]], wp.int32),
                         support_winding_number=many[b],
                         bvh_leaf_size=LEAF_SIZE,
                     )
@@ -116,7 +119,8 @@ class BodyMeshes:
             "face_offsets": (self.face_offsets, wp.int32),
             "faces": (self._faces, wp.vec3i),
             "vertices": (self._vertices, wp.vec3),
-            "rings": (integers(rings), wp.int32),
+            "rings": (integers(np.concatenate(list(rings.values()))), wp.int32),
+            "ring_offsets": (integers([ring_starts[b] for b in first]), wp.int32),
             "scattered": (integers(many), wp.int32),
             "loop_offsets": (integers(caps.bodies), wp.int32),
             "loops": (integers(caps.loops), wp.int32),
@@ -223,8 +227,23 @@ def _offsets(name: str, offsets: torch.Tensor | Sequence[int] | None, total: int
     return values
 
 
-def _check(vertices: torch.Tensor, faces: torch.Tensor, starts: list[int], face_starts: list[int]) -> torch.Tensor:
-    """Refuses bodies that `wp.Mesh` must not get. Returns the first vertex of the body of each face, int32 [G]."""
+def _topologies(
+    faces: np.ndarray, starts: list[int], face_starts: list[int]
+) -> tuple[list[int], dict[int, tuple[np.ndarray, int]]]:
+    """For each body the first one with the same faces; of these, faces as its own vertices, and number of vertices."""
+    known: dict[tuple[bytes, int], int] = {}
+    parts: dict[int, tuple[np.ndarray, int]] = {}
+    first = []
+    for b, (begin, end) in enumerate(pairwise(face_starts)):
+        part, count = faces[begin:end] - np.int32(starts[b]), starts[b + 1] - starts[b]
+        first.append(known.setdefault((part.tobytes(), count), b))
+        if first[-1] == b:
+            parts[b] = part, count
+    return first, parts
+
+
+def _check(vertices: torch.Tensor, faces: torch.Tensor, starts: list[int], face_starts: list[int]) -> None:
+    """Refuses bodies that `wp.Mesh` must not get."""
     sizes = [b - a for a, b in pairwise(face_starts)]
     empty = [b for b, size in enumerate(sizes) if size == 0]
     if empty:
@@ -243,4 +262,3 @@ def _check(vertices: torch.Tensor, faces: torch.Tensor, starts: list[int], face_
             f"{count} of {len(faces)} body faces name vertices their body does not have (first: face {first}, "
             f"{faces[first].tolist()}, whose body has vertices {int(low[first])} to {int(high[first]) - 1})"
         )
-    return low

@@ -46,6 +46,7 @@ class Bodies:
     faces: wp.array[wp.vec3i]  # packed vertex indices
     vertices: wp.array[wp.vec3]
     rings: wp.array2d[wp.int32]  # faces that share a corner or an edge, see nearest_face.rings_of
+    ring_offsets: wp.array[wp.int32]  # first row of each body in `rings`; bodies of the same faces share theirs
     scattered: wp.array[wp.int32]  # whether a body has too many holes to be closed by caps
     loop_offsets: wp.array[wp.int32]  # loops of each body, see mesh.caps.Caps
     loops: wp.array[wp.int32]
@@ -146,7 +147,7 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
         return wp.where(reach < MAX_DISTANCE, BEYOND, NOTHING), sign, nowhere, wp.vec3d(nowhere)
     # The search is in float32. Distances are flat around their minimum: where one is right to 1e-7 m, its point may be
     # 1e-4 m off. So the point is computed again, on the face that is named.
-    named = named_face(mesh, bodies.rings, bodies.face_offsets[b], face, point)
+    named = named_face(mesh, bodies.rings, bodies.ring_offsets[b], face, point)
     p, q, r = corners_of(mesh, named)
     weights = nearest_on_triangle(wp.vec3d(point), p, q, r)
     return named, sign, wp.vec3(weights), weights[0] * p + weights[1] * q + weights[2] * r

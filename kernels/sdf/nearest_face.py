@@ -33,16 +33,15 @@ CLOSE = wp.constant(wp.float64(0.02))  # barycentric, 0.4 mm of a usual edge: cl
 SLIVER = wp.constant(wp.float64(1.0e-12))  # (2 area / sum of squared edges)²; Warp's searches skip what is thinner
 
 
-def rings_of(faces: np.ndarray, face_starts: list[int]) -> np.ndarray:
+def rings_of(faces: np.ndarray) -> np.ndarray:
     """For each corner and each edge of each face, the next face that shares it; the faces of a part form a ring.
 
     Args:
-        faces: Packed vertex indices, integers [G, 3]; any number of faces may share an edge, in any orientation.
-        face_starts: Index at which the faces of each body begin, and G, [B + 1].
+        faces: Vertex indices of a body, integers [G, 3]; any number of faces may share an edge, in any orientation.
 
     Returns:
-        int32 [G, 6], one column per part: 6 times the next face (counted within its body), plus the number that the
-        part has in that face. The last face leads to the first; a single face leads to itself.
+        int32 [G, 6], one column per part: 6 times the next face, plus the number that the part has in that face. The
+        last face leads to the first; a single face leads to itself.
     """
     start = faces.astype(np.int64)
     end = start[:, [1, 2, 0]]
@@ -54,10 +53,9 @@ def rings_of(faces: np.ndarray, face_starts: list[int]) -> np.ndarray:
     is_first = np.append(True, is_last[:-1])
     following = np.append(order[1:], 0)
     following[is_last] = order[is_first]
-    rings = np.empty((len(faces), 6), np.int64)
+    rings = np.empty((len(faces), 6), np.int32)
     rings.ravel()[order] = following
-    first_face = np.repeat(face_starts[:-1], np.diff(face_starts))
-    return (rings - 6 * first_face[:, None]).astype(np.int32)
+    return rings
 
 
 @wp.func
@@ -193,13 +191,13 @@ def closest_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> w
 
 
 @wp.func
-def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_face: int, face: int, point: wp.vec3):
+def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_ring: int, face: int, point: wp.vec3):
     """The face that the rule of this module names, starting from a face that a search found.
 
     Args:
         mesh: The body.
-        rings: Result of `rings_of`, [G, 6].
-        first_face: First row of the body in `rings`.
+        rings: Results of `rings_of`, one after the other, [*, 6].
+        first_ring: First row of the body in `rings`.
         face: Face that the search found, counted within the body.
         point: Position [m].
     """
@@ -212,7 +210,7 @@ def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_face: int, fa
     while around >= 0 and around < PARTS and begin != PARTS * nearest + around:
         begin = PARTS * nearest + around
         named = nearest
-        at = rings[first_face + nearest, around]
+        at = rings[first_ring + nearest, around]
         while at != begin:
             other = at // PARTS
             shared = at - PARTS * other
@@ -225,7 +223,7 @@ def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_face: int, fa
                     if distance < least:
                         nearest = other
                         part = theirs
-            at = rings[first_face + other, shared]
+            at = rings[first_ring + other, shared]
         around = part
     if part == INSIDE:
         named = nearest

@@ -14,13 +14,14 @@ from support.scenes import network, skirt, tube, walk
 from warpgarment.errors import NotEnoughMemory
 from warpgarment.geometry.pooled_geodesics import CENTRES, NEAR, PooledGeodesics
 from warpgarment.kernels.collision.operator import Model
+from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.kernels.operator import pack, unpack
 from warpgarment.kernels.poisson.operator import matrix_of
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.nn.architecture import build_network
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.objects.garment import Garment
-from warpgarment.sim import memory
+from warpgarment.sim import history, memory
 from warpgarment.sim.simulator import Simulator
 
 FACTOR = 1.5
@@ -89,7 +90,8 @@ def test_prediction(garments, config, options):
 
     def run():
         state = sim.start(garments, motion.vertices[0], motion.faces, **splits)
-        sim.step(state, motion.vertices[1])
+        for _ in range(config.history if config is FAST else 1):  # until all frames of the history are its own
+            state = sim.step(state, motion.vertices[1])
         scenes.append(state.scene)
 
     unique = {id(g): g for g in garments}.values()
@@ -110,6 +112,26 @@ def test_prediction(garments, config, options):
     assert 0 <= kept <= predicted.parts["rows of compliance"]
     ratio = (predicted.total - predicted.parts["bodies"] - predicted.parts["rows of compliance"]) / measured
     assert 1 / FACTOR < ratio < FACTOR, f"{predicted}, measured {measured / 1e6:.1f} MB"
+
+
+def test_prediction_of_a_large_batch(monkeypatch):
+    """Garments of one mesh would count as several, or the history of a large batch as many times as that of a small
+    one. Two frames of a batch whose frames are tensors of their own, within a factor of 1.5 of torch's count."""
+    monkeypatch.setattr(history, "MOST_BYTES", 0)
+    motion, garments = walk(3), [garment(32, 17) for _ in range(12)]
+    sim = Simulator(build_network(FAST), "cpu")
+    predicted = memory.predict(garments, [motion], FAST)
+    assert predicted == memory.predict(garments[:1] * 12, [motion], FAST)
+    stack = 4 * FAST.history * FEATURES * sum(len(one.faces) for one in garments)
+    assert predicted.parts["history of features"] == pytest.approx(1.1 * stack)
+
+    def run():
+        state = sim.start(garments, motion.vertices[0], motion.faces)
+        for frame in (1, 2, *[1, 2] * 5):
+            state = sim.step(state, motion.vertices[frame])
+
+    ratio = predicted.total / allocated(run)
+    assert 1 / FACTOR < ratio < FACTOR, f"{predicted}, {ratio:.2f} of what was allocated"
 
 
 @pytest.mark.parametrize("garments", [[ONE, ONE], MANY, [MANY[1]] * 3])
@@ -133,6 +155,8 @@ def test_prediction_of_layers(garments):
 def test_batches_that_do_not_fit(monkeypatch):
     """The system would kill the process, or CUDA fail somewhere in the middle. What the message advises must fit."""
     garments = [garment(20, 13) for _ in range(8)]
+    for number, made in enumerate(garments):  # eight meshes, which share nothing
+        made.vertices = made.vertices * np.float32(1.0 + 1e-4 * number)
     sim = Simulator(network(), "cpu")
     needed = memory.predict(garments, [walk(1)], sim.network.config).total
     monkeypatch.setattr(memory, "free", lambda device: int(0.85 * needed / memory.USABLE))

@@ -142,7 +142,7 @@ def _measures(vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray) -> tup
     keys, own = np.unique(piece[:, None].astype(np.int64) * len(vertices) + faces, return_inverse=True)
     own = own.reshape(-1, 3)
     piece_of_vertex, position = keys // len(vertices), vertices[keys % len(vertices)]
-    caps = caps_of(own, len(keys), [0, len(keys)]).triangles
+    caps = caps_of(own, len(keys)).triangles
     owner = piece_of_vertex[caps[:, 0]] if len(caps) else np.zeros(0, np.int64)
     centre = np.zeros((count, 3))
     np.add.at(centre, piece_of_vertex, position)

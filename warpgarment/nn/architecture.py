@@ -42,12 +42,15 @@ class Architecture(Protocol):
             faces, whatever `face_splits` is, and training does so once garments are no longer split.
         positions: Whether networks of this kind answer with a `VertexStep`. They are trained on positions of whole
             outfits, and read no features of faces then.
+        apart: Whether networks of this kind read the frames of a history where each of them is, on a CPU, so that a
+            simulation need not put them side by side.
     """
 
     config: type[NetworkConfig]
     presets: Mapping[str, NetworkConfig]
     subsets: bool
     positions: bool = False
+    apart: bool = False
 
     def build(self, config: NetworkConfig) -> GarmentNetwork:
         """An untrained network."""

@@ -13,14 +13,25 @@ if TYPE_CHECKING:
     from warpgarment.objects.pack import PackedBodies
 
 
+class Frames(NamedTuple):
+    """Features of a packed batch whose frames are tensors of their own, so that a large one is not copied."""
+
+    frames: tuple[torch.Tensor, ...]  # [F,K] each, H of them, oldest first
+
+    def whole(self) -> torch.Tensor:
+        """All frames side by side, [F,H,K]."""
+        return torch.stack(self.frames, dim=1)
+
+
 class FrameInputs(NamedTuple):
     """A packed batch of F faces, V vertices and C connected components at frame t, in physical units and world space.
 
     `previous`, `previous_body`, `materials`, `wind`, `pairs` and `skin` are None unless the network `reads` them; it
-    gets `previous_body` with `previous`. `materials` and `wind` may be None all the same.
+    gets `previous_body` with `previous`. `materials` and `wind` may be None all the same. `features` are `Frames` only
+    for networks with the `predict` of `GarmentNetwork`.
     """
 
-    features: torch.Tensor  # [F,H,K] oldest first, all channels of kernels/features/channels.py
+    features: torch.Tensor | Frames  # [F,H,K] oldest first, all channels of kernels/features/channels.py
     velocities: torch.Tensor  # [C,H-1,3] of components, oldest first [m/frame]
     vertices: torch.Tensor  # [V,3] frame t [m]
     body: torch.Tensor  # [U,3] frame t [m]

@@ -25,7 +25,7 @@ from . import checkpoint
 from .attention import EncoderLayer
 from .config import STATISTICS, NetworkConfig
 from .heading import rotate_vectors
-from .inputs import FrameInputs, NormalisedOutput, RowInputs, VertexStep
+from .inputs import FrameInputs, Frames, NormalisedOutput, RowInputs, VertexStep
 from .parametrisation import NetworkOutput, Step, component_mean, compose, context
 from .rows import PaddedView, RowLayout, row_layout
 from .run import normalised, run
@@ -71,6 +71,11 @@ class GarmentNetwork(nn.Module):
     def launches(self) -> tuple[str, ...]:
         """Modules of `warpgarment.kernels` with kernels that the network launches on a CPU; for `compiling.ahead`."""
         return ("deformation.steps",)
+
+    @property
+    def takes_frames(self) -> bool:
+        """Whether `predict` takes `Frames`: networks that override it get one tensor."""
+        return type(self).predict is GarmentNetwork.predict
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -159,35 +164,38 @@ class GarmentNetwork(nn.Module):
             bfloat16: Whether the network runs in bfloat16, as in `run`.
         """
         assert isinstance(layout, RowLayout)
-        features, velocities, outside = self.packed_inputs(inputs, layout)
-        faces, components = len(features), len(velocities)
+        features, newest, velocities, outside = self.packed_inputs(inputs, layout)
+        faces, components = len(newest), len(velocities)
         output = NetworkOutput(
-            features.new_empty((faces, 3, 3)), features.new_empty((faces, 3)), features.new_zeros((components, 3))
+            newest.new_empty((faces, 3, 3)), newest.new_empty((faces, 3)), newest.new_zeros((components, 3))
         )
-        if features.device.type == "cpu" and not (torch.is_grad_enabled() or bfloat16):
+        if newest.device.type == "cpu" and not (torch.is_grad_enabled() or bfloat16):
             for view in layout.views:
-                self._step(view, view.inputs(features, velocities, outside), features, output)
-            body = component_mean(
-                features[:, -FEATURES:][:, LAYOUT["body_velocity"]], layout.face_component, components
-            )
+                self._step(view, view.inputs(features, velocities, outside), newest, output)
+            body = component_mean(newest[:, LAYOUT["body_velocity"]], layout.face_component, components)
             velocity = output.velocity + body if self.config.residual else output.velocity
             return Step(output.psi, output.singular_values, velocity)
         for view in layout.views:
             view.add_to(output, run(self, view.inputs(features, velocities, outside), bfloat16=bfloat16).output)
-        newest = context(features, layout.face_component, components)
-        return compose(output, newest, residual=self.config.residual)
+        moved = context(newest, layout.face_component, components)
+        return compose(output, moved, residual=self.config.residual)
 
     def packed_inputs(
         self, inputs: FrameInputs, layout: RowLayout
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Features [F,H*34], velocities [C,(H-1)*3] and outdoor channels [F,K] of a packed batch; None without any."""
+    ) -> tuple[torch.Tensor | Frames, torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Features [F,H*34] or `Frames`, those of the newest frame [F,34], velocities [C,(H-1)*3] and outdoor channels
+        [F,K] of a packed batch; None without any."""
         air = None if inputs.wind is None else inputs.wind[0]
         before = None if inputs.previous is None else inputs.previous[0]
         on = layout.faces, layout.garment_of_face
         outside = packed_columns(self.outdoor, self.config.fps, inputs.vertices, before, *on, inputs.materials, air)
-        return inputs.features.flatten(1), inputs.velocities.flatten(1), outside
+        velocities = inputs.velocities.flatten(1)
+        if isinstance(inputs.features, Frames):
+            return inputs.features, inputs.features.frames[-1], velocities, outside
+        features = inputs.features.flatten(1)
+        return features, features[:, -FEATURES:], velocities, outside
 
-    def _step(self, view: PaddedView, rows: RowInputs, features: torch.Tensor, output: NetworkOutput) -> None:
+    def _step(self, view: PaddedView, rows: RowInputs, newest: torch.Tensor, output: NetworkOutput) -> None:
         """Runs the network on a view and writes its steps: what `predict` does by operators, in a launch."""
         said, turn = normalised(self, rows)
         turn = torch.eye(3).expand(len(said.psi), 3, 3) if turn is None else turn
@@ -197,8 +205,8 @@ class GarmentNetwork(nn.Module):
             torch.cat(scale),
             turn.contiguous(),
             view.index,
-            features,
-            features.shape[1] - FEATURES + LAYOUT["body_deformation"].start,
+            newest,
+            LAYOUT["body_deformation"].start,
             (output.psi, output.singular_values),
             residual=self.config.residual,
         )

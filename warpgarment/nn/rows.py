@@ -23,7 +23,7 @@ from warpgarment.objects.pack import PackedGarments
 
 from .architecture import architecture
 from .config import NetworkConfig
-from .inputs import RowInputs
+from .inputs import Frames, RowInputs
 from .parametrisation import NetworkOutput
 
 TOKENS_PER_VIEW = 131_072  # most faces in one call of the network; bounds its activations to a few GB
@@ -58,8 +58,10 @@ class PaddedView:
         """Packed component of each entry, int64 [R,C]; -1 for padding."""
         return _or_none(self.component_index, self.component_mask)
 
-    def faces(self, packed: torch.Tensor) -> torch.Tensor:
-        """Takes values of packed faces to rows, [F,...] -> [R,N,...]."""
+    def faces(self, packed: torch.Tensor | Frames) -> torch.Tensor:
+        """Takes values of packed faces to rows, [F,...] -> [R,N,...]; frames side by side, [R,N,H*K]."""
+        if isinstance(packed, Frames):
+            return torch.cat([self.faces(frame) for frame in packed.frames], dim=-1)
         if self.begin is None:
             return packed[self.face_index]
         rows, count = self.face_index.shape
@@ -70,7 +72,7 @@ class PaddedView:
         return packed[self.component_index]
 
     def inputs(
-        self, features: torch.Tensor, velocities: torch.Tensor, outdoor: torch.Tensor | None = None
+        self, features: torch.Tensor | Frames, velocities: torch.Tensor, outdoor: torch.Tensor | None = None
     ) -> RowInputs:
         """Inputs of these rows, from packed features [F,H*K], velocities [C,(H-1)*3] and outdoor channels [F,K]."""
         rows = self.faces(features), self.components(velocities)

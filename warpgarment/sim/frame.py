@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import torch
 
+from warpgarment.nn.inputs import Frames
+
 from .history import History
 
 
@@ -14,7 +16,7 @@ class Frame(NamedTuple):
 
     positions: torch.Tensor  # [V,3] packed [m]; for a garment that failed, its last finite positions
     body: torch.Tensor  # [U,3] packed [m]
-    features: torch.Tensor  # [F,H-1,34] of the history
+    features: torch.Tensor | Frames  # [F,H-1,34] of the history; never `Frames` on a GPU
     velocities: torch.Tensor  # [C,H-1,3] of the history [m/frame]
     finite: torch.Tensor  # bool [B], whether a garment has been finite so far
     depth: torch.Tensor  # [B] depth of the deepest point of each garment in its body [m]

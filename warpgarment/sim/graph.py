@@ -72,11 +72,11 @@ class GraphedFrames:
         assert self._recorded is not None
         before, body, after, replay = self._recorded
         self.scene.bodies.at(now.body)
-        for held, given in zip((*before, body), (*now, next_body), strict=True):
+        for held, given in zip((*_tensors(before), body), (*_tensors(now), next_body), strict=True):
             held.copy_(given)
         replay()
         self.scene.bodies.placed = next_body  # the graph has moved the bodies' search trees there
-        return type(now)(*(tensor.clone() for tensor in after))._replace(body=next_body)
+        return Frame(*(tensor.clone() for tensor in _tensors(after)))._replace(body=next_body)
 
     @property
     def recorded(self) -> bool:
@@ -84,7 +84,7 @@ class GraphedFrames:
         return self._recorded is not None
 
     def _record(self, now: Frame, next_body: torch.Tensor) -> bool:
-        before, body = type(now)(*(tensor.clone() for tensor in now)), next_body.clone()
+        before, body = Frame(*(tensor.clone() for tensor in _tensors(now))), next_body.clone()
         self.scene.bodies.at(now.body)
         self.scene.bodies.placed = before.body  # the trees before each replay
         try:
@@ -104,3 +104,8 @@ class GraphedFrames:
             self.scene.bodies.placed = None
         self._recorded = before, body, after, replay
         return True
+
+
+def _tensors(frame: Frame) -> list[torch.Tensor]:
+    """The fields of a frame on a GPU, where histories are stacked: there are no `Frames`."""
+    return [field for field in frame if isinstance(field, torch.Tensor)]

@@ -26,6 +26,7 @@ from warpgarment.kernels.linear import factor
 from warpgarment.nn.architecture import architecture
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.inputs import NetworkSizes
+from warpgarment.nn.rows import first_equal
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedBodies
@@ -33,11 +34,11 @@ from warpgarment.objects.sizes import Sizes
 from warpgarment.sim.stages import relax
 from warpgarment.sim.stages.correct import Corrector
 
-from .history import STACKS, overlapping
+from .history import copies
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
-PER_BODY_FACE, PER_BODY_VERTEX = 520, 60  # bytes of Warp's tree with winding numbers and of ours; of two positions
+PER_BODY_FACE, PER_BODY_VERTEX = 240, 60  # bytes of Warp's tree and of ours; of two positions
 PER_MEETING_FACE = PARTNERS * (4 + 3 * 12) + 200  # bytes of pairs and their directions, and of boxes and a tree
 GRAPHED = 3  # copies of the history on a GPU: of a state, and the input and output of a graph
 INVERTING = 3, 2  # number of float64 matrices while the compliance of a component is made, on a GPU and on a CPU
@@ -80,7 +81,7 @@ def predict(
     """Predicts the peak memory of a batch on its device.
 
     Args:
-        garments: The batch; the same object several times shares its constants.
+        garments: The batch; garments of one mesh share their constants.
         bodies: The bodies of the batch, each once.
         config: Settings of the network.
         face_splits: Number of subsets of faces, as in `Simulator.rollout`.
@@ -95,6 +96,7 @@ def predict(
     """
     cpu = torch.device(device).type == "cpu"
     relaxes = bool(config.physics if physics is None else physics)
+    garments = [garments[first] for first in first_equal(garments)]  # those of one mesh share their constants
     unique = list({id(garment): garment for garment in garments}.values())
     sizes = Sizes.of(garments, bodies)
     _, vertices, faces, body_vertices, body_faces = sizes
@@ -109,14 +111,15 @@ def predict(
         "inverting compliance": INVERTING[cpu] * 8 * inverted,
     }
     peak = max(passing, key=lambda name: passing[name])
-    histories = (1 + STACKS if overlapping(faces, config.history) else 1) if cpu else GRAPHED
+    kind = architecture(config.architecture)
+    histories = copies(faces, config.history, separate=not kind.positions, apart=kind.apart) if cpu else GRAPHED
     return Memory(
         {
             **network,
             "compliance of collisions": blocks,
             "rows of compliance": _rows(unique) if cpu else 0,
             "factors of the solvers": _factors(unique, cpu),
-            "history of features": histories * 4 * config.history * FEATURES * faces,
+            "history of features": int(histories * 4 * config.history * FEATURES * faces),
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
             "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * relaxes,
             "pairs of layers": PER_MEETING_FACE * sum(len(garments[i].faces) for outfit in layers for i in outfit),

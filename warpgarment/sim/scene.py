@@ -21,7 +21,8 @@ from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
 from warpgarment.kernels.features.skin import Skin, bind
 from warpgarment.kernels.threads import torch_on_all
-from warpgarment.nn.inputs import FrameInputs, VertexStep
+from warpgarment.nn.architecture import architecture
+from warpgarment.nn.inputs import FrameInputs, Frames, VertexStep
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import Step
 from warpgarment.objects.clearance import clearance
@@ -122,7 +123,9 @@ class Scene:
         self.brought = brought
         self.packed = packed = PackedGarments.pack(garments, device)
         self.inverse_rest = inverse_rest_frames(packed.rest_vertices, packed.faces)
-        self.bodies, self.stacks = MovingBodies(body_vertices, bodies), Stacks()
+        self.bodies = MovingBodies(body_vertices, bodies)
+        apart = architecture(network.config.architecture).apart
+        self.stacks = Stacks(separate=network.takes_frames, apart=apart)
         body_of_vertex = bodies.body_of_garment[packed.garment_of_vertex.long()]
         body_of_face = bodies.body_of_garment[packed.garment_of_face.long()]
         self._refuse_far(first_vertices, body_of_vertex)
@@ -175,7 +178,7 @@ class Scene:
                     "wg.dress (--dress), or with wg.fit (--fit-rest) if it was modelled on this body."
                 )
 
-    def inputs(self, now: Frame, features: torch.Tensor, next_body: torch.Tensor) -> FrameInputs:
+    def inputs(self, now: Frame, features: torch.Tensor | Frames, next_body: torch.Tensor) -> FrameInputs:
         """What the network gets of a frame.
 
         Args:

@@ -85,7 +85,7 @@ def starting_states(
         if frame:
             features = scene.features(known[frame - 1], bodies[frame - 1], body)
             velocity = scene.centroids(vertices) - scene.centroids(known[frame - 1])
-            history = history.followed(history.stacked(features), velocity)
+            history = history.followed(scene.stacks(history, features), velocity)
         depth = scene.contact.depth(vertices, body)
         past = [max(frame - k, 0) for k in (1, 2)] if "previous" in reads else []
         blown = [air[frame], air[max(frame - 1, 0)]] if "wind" in reads else []

@@ -8,7 +8,7 @@ from support.meshes import irregular_grid, skirt, two_components
 from warpgarment.kernels.features.channels import FACE, LAYOUT
 from warpgarment.nn.architecture import build_network
 from warpgarment.nn.config import NetworkConfig
-from warpgarment.nn.inputs import FrameInputs
+from warpgarment.nn.inputs import FrameInputs, Frames
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
@@ -44,5 +44,7 @@ def test_it_is_what_the_operators_make(chosen, residual, heading):
     expected = network.predict(given, layout)
     with torch.no_grad():
         result = network.predict(given, layout)
+        frames = network.predict(given._replace(features=Frames(features.unbind(1))), layout)
     for one, other in zip(result, expected, strict=True):
         close(one, other.detach(), 1e-5 * max(1.0, other.abs().max().item()))
+    assert all(torch.equal(one, other) for one, other in zip(result, frames, strict=True))  # of a large batch

@@ -64,7 +64,8 @@ def test_turned_weights(monkeypatch):
     index[1, -3:] = -1
     packed_faces = x.flatten(0, 1).clone()
     packed_faces[index[index >= 0]] = x[index >= 0]
-    result = faces.embed(packed_faces, index, *turned(weight, mean, F.pad(turns, (0, 14))), bias)
+    listed = packed_faces.unflatten(1, (frames, channels)).unbind(1)
+    result = faces.embed(listed, index, *turned(weight, mean, F.pad(turns, (0, 14))), bias)
     assert len(allocated) == 3
     seen = x.double().unflatten(2, (frames, channels)) - torch.einsum("i,rij->rj", mean, turns)[:, None, None].double()
     expected = torch.einsum("ehi,rij,rnhj->rne", weight.double(), turns.double(), seen) + bias.double()

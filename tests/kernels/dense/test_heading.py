@@ -26,9 +26,8 @@ def model(canonical: bool) -> heads.Model:
 
 def found_of(features: torch.Tensor, given: heads.Model) -> tuple[heads.Heading, torch.Tensor, heads.Rows]:
     rows, velocity = heads.Rows(INDEX, PIECE, PIECE_OF_FACE), normal(3, 3 * (FRAMES - 1))
-    newest = (FRAMES - 1) * FEATURES
-    columns = (newest + LAYOUT[name].start for name in ("deformation_gradient", "body_velocity"))
-    return heads.heading(features, velocity, rows, given, *columns), velocity, rows
+    columns = (LAYOUT[name].start for name in ("deformation_gradient", "body_velocity"))
+    return heads.heading(features[:, -FEATURES:], velocity, rows, given, *columns), velocity, rows
 
 
 @pytest.mark.parametrize("canonical", [False, True])

@@ -104,7 +104,7 @@ def test_every_ray_counts_the_winding_number(name):
 def test_caps_close_bodies(name):
     """A hole left open would turn the crossing number of a ray through it into nonsense."""
     body = BODIES[name]
-    caps = caps_of(body.faces, len(body.vertices), [0, len(body.vertices)])
+    caps = caps_of(body.faces, len(body.vertices))
     together = np.concatenate([body.faces, caps.triangles])
     net = np.zeros((len(body.vertices),) * 2, int)
     for k in range(3):
@@ -136,7 +136,7 @@ def test_signs_are_those_of_winding_numbers(name):
 def test_bodies_in_pieces_keep_summing():
     """The test above would not see the second way if the soup went the first."""
     body = soup()
-    caps = caps_of(body.faces, len(body.vertices), [0, len(body.vertices)])
+    caps = caps_of(body.faces, len(body.vertices))
     assert len(caps.triangles) > inside.MOST_CAPS
     bodies = sdf.BodyMeshes(torch.tensor(body.vertices), torch.tensor(body.faces))
     assert bodies.model.scattered.numpy().tolist() == [1]

@@ -126,7 +126,7 @@ def test_it_does_not_matter_which_neighbour_was_found():
     found, which = touching[:, expected].nonzero()
     assert len(found) > 10 * len(points)
     warp_mesh = wp.Mesh(wp.array(mesh.vertices, dtype=wp.vec3), wp.array(mesh.faces.ravel(), dtype=wp.int32))
-    rings = wp.array(kernel.rings_of(mesh.faces, [0, len(mesh.faces)]), dtype=wp.int32)
+    rings = wp.array(kernel.rings_of(mesh.faces), dtype=wp.int32)
     named = wp.full(len(found), -99, dtype=wp.int32)
     inputs = [warp_mesh.id, rings, wp.array(found.astype(np.int32)), wp.array(points[which], dtype=wp.vec3)]
     wp.launch(name_faces, dim=len(found), inputs=inputs, outputs=[named])
@@ -174,3 +174,16 @@ def test_slivers_are_not_named():
     expected = nearest_face(points, mesh.vertices, mesh.faces)
     assert expected.face.min() > 1
     np.testing.assert_array_equal(asked(mesh, points)[2], expected.face)
+
+
+def test_bodies_of_the_same_faces_share_their_rings():
+    """Two hundred bodies would take the memory of two hundred, or a body get the rings of one with other faces."""
+    parts = [meshes.posed_body(0.3), shuffled(meshes.posed_body(0.3), 1), meshes.posed_body(1.1)]
+    joined = meshes.joined(*parts)
+    bodies = sdf.BodyMeshes(
+        torch.tensor(joined.vertices), torch.tensor(joined.faces), *[o.tolist() for o in meshes.offsets(*parts)]
+    )
+    count = len(parts[0].faces)
+    assert bodies.model.ring_offsets.numpy().tolist() == [0, count, 0]
+    expected = np.concatenate([kernel.rings_of(part.faces) for part in parts[:2]])
+    np.testing.assert_array_equal(bodies.model.rings.numpy(), expected)

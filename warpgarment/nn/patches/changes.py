@@ -7,6 +7,8 @@ torch counts the changes of a tensor in its version, but an optimiser that updat
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable, Mapping
+from operator import attrgetter, getitem, is_
 from typing import Any
 
 import torch
@@ -24,6 +26,34 @@ def optimiser_steps() -> int:
 def version(tensor: torch.Tensor) -> int:
     """The version of a tensor; 0 of one that was made in inference mode, which does not count its changes."""
     return 0 if tensor.is_inference() else tensor._version
+
+
+class Sources:
+    """Parameters and buffers of modules as they are now; they are asked for changes in every frame.
+
+    Args:
+        places: Where a module keeps each of them, and its name there.
+
+    Attributes:
+        counted: Whether torch counts the changes of all of them; those made in inference mode are not.
+    """
+
+    def __init__(self, places: Iterable[tuple[Mapping[str, torch.Tensor | None], str]]) -> None:
+        listed = list(places)
+        self._places, self._names = [place for place, _ in listed], [name for _, name in listed]
+        self._values = list(map(getitem, self._places, self._names))
+        self._tensors = [value for value in self._values if value is not None]
+        self.counted = not any(tensor.is_inference() for tensor in self._tensors)
+        self._state = self._now() if self.counted else None
+
+    def unchanged(self) -> bool:
+        """Whether the modules still have the same tensors, with the same values; False if these are not `counted`."""
+        same = all(map(is_, map(getitem, self._places, self._names), self._values))
+        return same and self._state is not None and self._state == self._now()
+
+    def _now(self) -> tuple[int, list[int], list[int]]:
+        addresses = list(map(torch.Tensor.data_ptr, self._tensors))
+        return _steps, addresses, list(map(attrgetter("_version"), self._tensors))
 
 
 def _count(*_: Any) -> None:

@@ -7,7 +7,6 @@ Weights are packed once per network. The scale and shift of a layer norm are par
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 from weakref import WeakKeyDictionary
 
@@ -21,6 +20,7 @@ from warpgarment.kernels.dense import heading as heads
 from warpgarment.kernels.dense import products, tokens
 from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT, Kind, Layout
+from warpgarment.nn.inputs import Frames
 from warpgarment.nn.parametrisation import Step
 
 from . import changes
@@ -35,24 +35,10 @@ if TYPE_CHECKING:
     from .network import FaceLayer, PatchTransformer
 
 
-Place = Mapping[str, torch.Tensor | None]
-
-
-class Source(NamedTuple):
-    """A parameter or a buffer of a module, as it was."""
-
-    place: Place  # where its module keeps it
-    name: str
-    value: torch.Tensor
-    address: int
-    version: int
-
-
 class Packed(NamedTuple):
     """The weights of the layers of faces as the kernels read them."""
 
-    sources: list[Source]  # the parameters and statistics they were made from
-    steps: int  # of optimisers until then
+    sources: changes.Sources  # the parameters and statistics they were made from
     embed: torch.Tensor  # [F,H,K], over the deviations of the features
     bias: torch.Tensor  # [F]
     heading: heads.Model
@@ -63,15 +49,6 @@ class Packed(NamedTuple):
     alone: list[dense.Perceptron]  # for subsets of faces
     head: dense.Head
     encoder: tokens.Encoder
-
-    def fresh(self) -> bool:
-        """Whether no weight has changed since: the modules still have the same tensors, with the same values."""
-        if self.steps != changes.optimiser_steps():
-            return False
-        for place, name, value, address, version in self.sources:
-            if place[name] is not value or value.data_ptr() != address or changes.version(value) != version:
-                return False
-        return True
 
 
 STATISTICS = (
@@ -95,9 +72,14 @@ def suits(network: PatchTransformer, count: int = 0) -> bool:
     """Whether this processor has vectors, and the widths are whole numbers of tiles; nothing is compiled."""
     config, fit = _fitting.get(network, (None, False))
     if config is not network.config:
-        config, fit = network.config, _widths_fit(network.config)
+        config, fit = network.config, planned(network.config)
         _fitting[network] = config, fit
-    return fit and count <= tokens.MOST_TOKENS and products.present()
+    return fit and count <= tokens.MOST_TOKENS
+
+
+def planned(config: NetworkConfig) -> bool:
+    """The same of a network that is not made yet."""
+    return products.present() and _widths_fit(config)
 
 
 def _widths_fit(config: NetworkConfig) -> bool:
@@ -113,22 +95,17 @@ def _widths_fit(config: NetworkConfig) -> bool:
 def packed(network: PatchTransformer) -> Packed:
     """The packed weights of a network, made anew when a weight has changed."""
     known = _known.get(network)
-    if known is None or not known.fresh():
+    if known is None or not known.sources.unchanged():
         known = _pack(network)
-        if not any(source.value.is_inference() for source in known.sources):  # these do not count their changes
+        if known.sources.counted:
             _known[network] = known
     return known
 
 
-def _sources(network: PatchTransformer) -> list[Source]:
+def _sources(network: PatchTransformer) -> changes.Sources:
     """All parameters of a network and the statistics that are part of its weights."""
-    places: list[tuple[Place, str]] = [(m._parameters, name) for m in network.modules() for name in m._parameters]
-    found = []
-    for place, name in [*places, *((network._buffers, name) for name in STATISTICS)]:
-        value = place[name]
-        if value is not None:
-            found.append(Source(place, name, value, value.data_ptr(), changes.version(value)))
-    return found
+    parameters = [(module._parameters, name) for module in network.modules() for name in module._parameters]
+    return changes.Sources([*parameters, *((network._buffers, name) for name in STATISTICS)])
 
 
 def _pack(network: PatchTransformer) -> Packed:
@@ -138,7 +115,6 @@ def _pack(network: PatchTransformer) -> Packed:
     head, head_bias = folded(network.face_norm, network.face_head.weight, network.face_head.bias)
     return Packed(
         _sources(network),
-        changes.optimiser_steps(),
         (weight / network.feature_std).contiguous(),
         network.embed_faces.bias.detach(),
         heads.Model(
@@ -242,17 +218,17 @@ def predicts(network: PatchTransformer, layout: RowLayout) -> bool:
 
 def predict(network: PatchTransformer, inputs: FrameInputs, layout: RowLayout) -> Step:
     """`GarmentNetwork.predict` on a CPU without gradients, by launches that have all operators in them."""
-    features, velocities, outside = network.packed_inputs(inputs, layout)
-    read, weights, residual = network.read(features), packed(network), network.config.residual
-    newest = features.shape[1] - FEATURES
-    columns = (newest + LAYOUT[name].start for name in ("deformation_gradient", "body_velocity", "body_deformation"))
+    features, newest, velocities, outside = network.packed_inputs(inputs, layout)
+    frames = features.frames if isinstance(features, Frames) else features.unflatten(1, (-1, FEATURES)).unbind(1)
+    read = [network.read(frame) for frame in frames]
+    weights, residual = packed(network), network.config.residual
+    columns = (LAYOUT[name].start for name in ("deformation_gradient", "body_velocity", "body_deformation"))
     gradient, body_velocity, body = columns
-    step = Step(
-        *(features.new_empty(shape) for shape in ((len(features), 3, 3), (len(features), 3), (len(velocities), 3)))
-    )
+    shapes = (len(newest), 3, 3), (len(newest), 3), (len(velocities), 3)
+    step = Step(*(newest.new_empty(shape) for shape in shapes))
     for view in layout.views:
         rows = heads.Rows(view.index, view.piece, layout.face_component)
-        found = heads.heading(features, velocities, rows, weights.heading, gradient, body_velocity)
+        found = heads.heading(newest, velocities, rows, weights.heading, gradient, body_velocity)
         faces = dense.embed(read, rows.face, *turned(weights.embed, network.feature_mean, found.turns), weights.bias)
         if network.outdoor.width:
             outdoor = None if outside is None else network.known(view.faces(outside))
@@ -262,7 +238,7 @@ def predict(network: PatchTransformer, inputs: FrameInputs, layout: RowLayout) -
         mask = network.key_mask(view.weights, view.component_mask, found.tokens)
         answer, velocity = forward(weights, faces, found.tokens, view.weights, mask)
         written = step.psi, step.singular_values
-        steps(answer, weights.step_scale, found.turn, rows.face, features, body, written, residual=residual)
+        steps(answer, weights.step_scale, found.turn, rows.face, newest, body, written, residual=residual)
         heads.velocities(velocity, found, rows, weights.velocity_scale, step.velocity, residual=residual)
     return step
 
@@ -275,7 +251,8 @@ def embedded(network: PatchTransformer, features: torch.Tensor, turn: torch.Tens
     turns = entries[:, weights.heading.first] * entries[:, weights.heading.second]
     index = torch.arange(features.shape[0] * features.shape[1]).reshape(features.shape[:2])
     centre_and_weight = turned(weights.embed, network.feature_mean, turns)
-    return dense.embed(features.flatten(0, 1), index, *centre_and_weight, weights.bias)
+    frames = features.flatten(0, 1).unflatten(1, (-1, network.channels.width)).unbind(1)
+    return dense.embed(frames, index, *centre_and_weight, weights.bias)
 
 
 def forward(

@@ -83,6 +83,11 @@ class PatchTransformer(GarmentNetwork):
         """As in `GarmentNetwork`, and the kernels of its layers on a processor that has vectors for them."""
         return (*super().launches, *(fused.LAUNCHED if fused.suits(self) else ()))
 
+    @property
+    def takes_frames(self) -> bool:
+        """As in `GarmentNetwork`."""
+        return type(self).predict is PatchTransformer.predict
+
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         width = config.face_embedding
@@ -144,7 +149,7 @@ class PatchTransformer(GarmentNetwork):
 
     def predict(self, inputs: FrameInputs, layout: RowLayout, *, bfloat16: bool = False) -> Step | VertexStep:
         """As in `GarmentNetwork`; on a CPU without gradients by few launches."""
-        if not bfloat16 and blocks.by_blocks(inputs.features) and fused.predicts(self, layout):
+        if not bfloat16 and blocks.by_blocks(inputs.vertices) and fused.predicts(self, layout):
             return fused.predict(self, inputs, layout)
         return super().predict(inputs, layout, bfloat16=bfloat16)
 
