@@ -70,7 +70,7 @@ HEAD = """
     for (int i = 0; i < 32; i++)
         for (int j = 0; j < wide_head; j++) h[i * wide_head + j] = j < outputs ? head_bias.data[j] : 0.0f;
     Matrix::begin();
-    Matrix::product(left, width, head.data, 0, width / 32, width / 32, wide_head, h, wide_head);
+    Matrix::product(last, width, head.data, 0, width / 32, width / 32, wide_head, h, wide_head);
     Matrix::end();
     for (int i = 0; i < many; i++)
         for (int j = 0; j < outputs; j++) result.data[(at + i) * outputs + j] = h[i * wide_head + j];
@@ -80,14 +80,17 @@ PERCEPTRON = """
     Matrix::begin();
     for (int i = 0; i < 32; i++)
         for (int j = 0; j < hidden; j += 16) Vector::store(h + i * hidden + j, Vector::load(expand_bias.data + j));
-    Matrix::product(left, wide, expand.data, 0, wide / 32, wide / 32, hidden, h, hidden);
-    for (int i = 0; i < 32 * hidden; i += 16) left.put(i, Vector::gelu(Vector::load(h + i)));
-    for (int i = 0; i < 32; i++)
+    Inner::product(left, wide, expand.data, wide / 32, hidden, h, hidden);
+    for (int i = 0; i < 32; i++) {
+        float* y = h + i * hidden;
+        for (int j = 0; j < hidden; j += 16) Vector::store(y + j, Vector::gelu(Vector::load(y + j)));
+        left.row(i, y, hidden);
         for (int j = 0; j < width; j += 16) {
             v16 old = i < many ? Vector::load(x + i * width + j) : v16{};
             Vector::store(c + i * width + j, old + Vector::load(contract_bias.data + j));
         }
-    Matrix::product(left, hidden, contract.data, 0, hidden / 32, hidden / 32, width, c, width);
+    }
+    Inner::product(left, hidden, contract.data, hidden / 32, width, c, width);
     Matrix::end();
     if (!outputs) __builtin_memcpy(x, c, 4l * many * width);
 """
@@ -98,13 +101,13 @@ PERCEPTRON = """
         PLACE
         + """
     alignas(64) float h[32 * 256], c[32 * 256];
-    LEFT(left, 32 * 256);
+    INNER(left, 32 * 256);
     const int wide = width, outputs = 0;
     float* x = faces.data + at * width;
+    __builtin_memset(c, 0, 4l * width);
     for (int i = 0; i < 32; i++) {
         if (i < many) Vector::norm(x + i * width, width, c);
-        for (int j = 0; j < width; j += 16)
-            left.put(i * wide + j, i < many ? Vector::load(c + j) : v16{});
+        left.row(i, c, width);
     }
 """
         + PERCEPTRON
@@ -166,27 +169,30 @@ def spread_block(
         PLACE
         + """
     alignas(64) float h[32 * 256], c[32 * 256];
-    LEFT(left, 32 * 512);
+    alignas(64) float line[512] = {0.0f};
+    INNER(left, 32 * 512);
+    LEFT(last, 32 * 256);
     const long to = (long)(row % layouts) * count + from;
     const int wide = hears ? 2 * width : width;
     float* x = faces.data + at * width;
     const float* all = own.data + (long)row * count * width;
-    for (int i = 0; i < 32; i++)
-        for (int j = 0; j < width; j += 16) {
-            v16 mine = i < many ? Vector::load(own.data + (at + i) * width + j) : v16{};
-            left.put(i * wide + j, mine);
+    for (int i = 0; i < 32; i++) {
+        for (int j = 0; j < width && i < many; j += 16) {
+            Vector::store(line + j, Vector::load(own.data + (at + i) * width + j));
             if (!hears) continue;
             v16 sum = {};
-            for (int k = 0; k < 3 && i < many; k++) sum += Vector::load(all + side.data[3 * (to + i) + k] * width + j);
-            left.put(i * wide + width + j, sum * Vector::all(1.0f / 3.0f));
+            for (int k = 0; k < 3; k++) sum += Vector::load(all + side.data[3 * (to + i) + k] * width + j);
+            Vector::store(line + width + j, sum * Vector::all(1.0f / 3.0f));
         }
+        left.row(i, line, wide);
+    }
 """
         + PERCEPTRON
         + """
     for (int i = 0; i < many && !outputs; i++) Vector::norm(c + i * width, width, result.data + (at + i) * width);
     for (int i = 0; i < 32 && outputs; i++) Vector::norm(c + i * width, width, c + i * width);
     if (outputs) {
-        for (int i = 0; i < 32 * width; i += 16) left.put(i, Vector::load(c + i));
+        for (int i = 0; i < 32 * width; i += 16) last.put(i, Vector::load(c + i));
 """
         + HEAD
         + """
@@ -220,10 +226,10 @@ def hear_block(
         PLACE
         + """
     alignas(64) float h[32 * 256];
-    LEFT(left, 32 * 256);
+    LEFT(last, 32 * 256);
     for (int i = 0; i < 32; i++)
         for (int j = 0; j < width; j += 16)
-            left.put(i * width + j, i < many ? Vector::load(own.data + (at + i) * width + j) : v16{});
+            last.put(i * width + j, i < many ? Vector::load(own.data + (at + i) * width + j) : v16{});
 """
         + HEAD
     )

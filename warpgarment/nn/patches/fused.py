@@ -205,9 +205,8 @@ def _perceptron(layer: FaceLayer, *, hears: bool) -> dense.Perceptron:
     if hears:
         around, bias = folded(layer.norm, layer.hear.weight, bias)
         weight = torch.cat([weight, around], dim=1)
-    return dense.Perceptron(
-        packed_weights(weight), bias, packed_weights(layer.contract.weight), layer.contract.bias.detach()
-    )
+    expand, contract = products.pack_inner(weight), products.pack_inner(layer.contract.weight)
+    return dense.Perceptron(expand, bias, contract, layer.contract.bias.detach())
 
 
 def predicts(network: PatchTransformer, layout: RowLayout) -> bool:
