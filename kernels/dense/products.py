@@ -28,6 +28,7 @@ bits, so sums are exact. A number of a row of 128 is off by 1e-4 of the row's de
 | `Matrix::column` | puts column n of a tile |
 | `Matrix::begin`, `end` | stand around products |
 | `INNER(a, n)`, `a.row(i, x, width)`, `Inner::product` | the same for products of inner layers; puts row i |
+| `Inner::size` | numbers in memory of b [rows, columns], packed |
 
 The kernels that use this are functions in C++ (`wp.func_native`), since Warp's vectors are no registers, and it has no
 word for tiles of AMX. They do nothing where the compiler is told of no vectors, as on GPUs; `available` says whether
@@ -225,8 +226,10 @@ struct Inner {
             for (int j = 0; j < width; j += 16) plain.put((long)i * width + j, Vector::load(x + j));
         }
     };
-    static inline void product(Left a, int lda, const float* right, int depth, int columns, float* c, int ldc) {
-        Matrix::product(a.plain, lda, right, 0, depth, depth, columns, c, ldc);
+    static inline long size(int columns, int rows) { return (long)columns * rows; }
+    static inline void product(Left a, int lda, const float* right, int depth, int columns, float* c, int ldc,
+                               int down = 32) {
+        Matrix::product(a.plain, lda, right, 0, depth, depth, columns, c, ldc, down);
     }
 };
 """
@@ -261,12 +264,14 @@ struct Inner {
         }
     };
     // after the tiles of b, [pair of rows, column, row of the pair], are the units of its columns
-    static void product(Left a, int lda, const float* right, int depth, int columns, float* c, int ldc) {
+    static inline long size(int columns, int rows) { return (long)columns * (rows / 2 + 1); }
+    static void product(Left a, int lda, const float* right, int depth, int columns, float* c, int ldc,
+                        int down = 32) {
         const float* units = right + (long)columns * depth * 16;
         for (int n = 0; n < columns; n += 32) {
             const int* b = (const int*)right + (long)(n / 16) * depth * 256;
             const int* next = b + (long)depth * 256;
-            for (int m = 0; m < 32; m += 8) {
+            for (int m = 0; m < down; m += 8) {
                 const int* x = (const int*)(a.all + (long)m * lda);
                 i16 sum[8][2];
                 for (int i = 0; i < 8; i++) sum[i][0] = sum[i][1] = i16{};

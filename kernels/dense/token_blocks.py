@@ -120,23 +120,29 @@ LAYER = """
                 }
             Matrix::product(left, Tp, v + (long)L * Tp, 0, blocks, blocks, E - L, c + L, E, down);
         }
-        for (int i = 0; i < down; i++)
-            for (int j = 0; j < E; j += 16) {
-                left.put(i * E + j, Vector::load(c + i * E + j));
+        for (int i = 0; i < down; i++) {
+            inner.row(i, c + i * E, E);
+            for (int j = 0; j < E; j += 16)
                 Vector::store(x + i * E + j, Vector::load(x + i * E + j) + Vector::load(b + Q + j));
-            }
-        Matrix::product(left, E, w + (long)E * Q, 0, E / 32, E / 32, E, x, E, down);
+        }
+        w += Inner::size(Q, E);
+        Inner::product(inner, E, w, E / 32, E, x, E, down);
         for (int i = 0; i < down; i++) {  // feed-forward
             Vector::norm(x + i * E, E, c);
-            for (int j = 0; j < E; j += 16) {
-                left.put(i * E + j, Vector::load(c + j));
+            inner.row(i, c, E);
+            for (int j = 0; j < E; j += 16)
                 Vector::store(x + i * E + j, Vector::load(x + i * E + j) + Vector::load(b + Q + E + H + j));
-            }
             for (int j = 0; j < H; j += 16) Vector::store(s + i * H + j, Vector::load(b + Q + E + j));
         }
-        Matrix::product(left, E, w + (long)E * (Q + E), 0, E / 32, E / 32, H, s, H, down);
-        for (int i = 0; i < down * H; i += 16) left.put(i, Vector::gelu(Vector::load(s + i)));
-        Matrix::product(left, H, w + (long)E * (Q + E + H), 0, H / 32, H / 32, E, x, E, down);
+        w += Inner::size(E, E);
+        Inner::product(inner, E, w, E / 32, H, s, H, down);
+        for (int i = 0; i < down; i++) {
+            float* y = s + i * H;
+            for (int j = 0; j < H; j += 16) Vector::store(y + j, Vector::gelu(Vector::load(y + j)));
+            inner.row(i, y, H);
+        }
+        w += Inner::size(H, E);
+        Inner::product(inner, H, w, H / 32, E, x, E, down);
     }
 """
 
@@ -149,10 +155,10 @@ KEYS = """
         float* v = q + 2l * Tp * L;
         for (int i = 0; i < down; i++) {
             Vector::norm(x + i * E, E, c);
-            for (int j = 0; j < E; j += 16) left.put(i * E + j, Vector::load(c + j));
+            inner.row(i, c, E);
             for (int j = 0; j < Q; j += 16) Vector::store(s + i * Q + j, Vector::load(b + j));
         }
-        Matrix::product(left, E, w, 0, E / 32, E / 32, Q, s, Q, down);
+        Inner::product(inner, E, w, E / 32, Q, s, Q, down);
         for (int i = 0; i < 32; i++) {
             if (i >= many)
                 for (int j = 0; j < Q; j += 16) Vector::store(s + i * Q + j, v16{});
@@ -205,9 +211,11 @@ STAGE = source(
     + """
     alignas(64) float c[32 * 256], s[32 * 1024], open[1024], scale[32];
     LEFT(left, 32 * 1024);
+    INNER(inner, 32 * 256);
     const int row = t / blocks, from = 32 * (t % blocks), many = T - from < 32 ? T - from : 32;
     const int down = (many + 7) / 8 * 8;
-    const long layer_weights = (long)E * (Q + E + 2 * H), layer_biases = Q + 2 * E + H;
+    const long layer_weights = Inner::size(Q, E) + Inner::size(E, E) + Inner::size(H, E) + Inner::size(E, H);
+    const long layer_biases = Q + 2 * E + H;
     const long stride = (long)Tp * (2 * E + F) + 2l * Tp * Q;
     float* mine = room.data + row * stride;
     float* x = mine + (long)from * E;

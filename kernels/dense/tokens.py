@@ -99,7 +99,9 @@ class Encoder(NamedTuple):
     layers: int
     pool: torch.Tensor  # packed, of [E,F]
     pool_bias: torch.Tensor  # [E]
-    weights: torch.Tensor  # packed, of each layer: queries, keys and values; out; expand; contract. Then of heard [F,E]
+    weights: (
+        torch.Tensor
+    )  # of `pack_inner`: each layer's queries, keys, values; out; expand; contract. Of `pack`: heard [F,E]
     biases: torch.Tensor  # of the same; of the velocity head, [3]; its weights [3,E]; weights W_v [E,F]
 
 

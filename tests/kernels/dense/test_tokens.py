@@ -12,8 +12,10 @@ pytestmark = pytest.mark.skipif(not products.available(), reason="this processor
 
 ROWS, COUNT, WIDTH, EMBEDDING, HIDDEN, HEAD, LAYERS = 2, 90, 32, 96, 64, 32, 2
 PATCHES, PIECES = 41, 3  # 44 tokens: a block of 32, and one of 12 that has patches and velocities
-OFF = 3e-5 if products.ON_TILES else 5e-6
-"""Of the largest output: products on tiles lose 2^-17 of each term, 8e-6, in each of a dozen. bfloat16 alone: 1e-2."""
+OFF = 3e-5 if products.ON_TILES else 1e-3 if products.INTEGERS else 5e-6
+"""Of the largest output: products on tiles lose 2^-17 of each term, 8e-6, in each of a dozen. bfloat16 alone: 1e-2.
+
+Integers of rows of 96 are 6e-5 of their deviation off."""
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -48,7 +50,7 @@ def test_the_encoder(layouts, learned, padded, monkeypatch):
     each = [biases[n] for n in (columns, EMBEDDING, HIDDEN, EMBEDDING)] * LAYERS
     encoder = tokens.Encoder(
         EMBEDDING, learned, HEAD, HIDDEN, LAYERS, packed(to_patches), biases[EMBEDDING],
-        torch.cat([packed(w) for w in [*(w for layer in layers for w in layer), heard]]),
+        torch.cat([*(products.pack_inner(w) for layer in layers for w in layer), packed(heard)]),
         torch.cat([b.flatten() for b in [*each, biases[WIDTH], biases[3], velocity, to_velocity]]),
     )  # fmt: skip
     x, given = normal(ROWS, COUNT, WIDTH), normal(ROWS, PIECES, EMBEDDING)
@@ -98,7 +100,8 @@ def test_a_row_does_not_depend_on_padding_or_others():
     """A garment would move otherwise with others beside it, or with a pool of threads. Exact, with any threads."""
     encoder = tokens.Encoder(
         EMBEDDING, 64, HEAD, HIDDEN, 1, packed(weight(EMBEDDING, WIDTH)), normal(EMBEDDING),
-        torch.cat([packed(weight(o, i)) for o, i in ((224, 96), (96, 96), (64, 96), (96, 64), (32, 96))]),
+        torch.cat([*(products.pack_inner(weight(o, i)) for o, i in ((224, 96), (96, 96), (64, 96), (96, 64))),
+                   packed(weight(32, 96))]),
         torch.cat([normal(224), normal(96), normal(64), normal(96), normal(32), normal(3), normal(3 * 96),
                    normal(96 * 32)]),
     )  # fmt: skip

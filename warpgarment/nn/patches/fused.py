@@ -174,7 +174,6 @@ def _encoder(network: PatchTransformer) -> tokens.Encoder:
         weights += [weight * root[:, None], out.weight, expand, layer.contract.weight]
         biases += [bias * root, out.bias, expand_bias, layer.contract.bias]
     velocity, velocity_bias = folded(network.final_norm, network.velocity_head.weight, network.velocity_head.bias)
-    weights.append(network.from_patches.weight)
     biases += [network.from_patches.bias, velocity_bias, velocity, network.to_velocity.weight]
     return tokens.Encoder(
         config.embedding,
@@ -184,7 +183,7 @@ def _encoder(network: PatchTransformer) -> tokens.Encoder:
         config.layers,
         packed_weights(network.to_patches.weight),
         network.to_patches.bias.detach(),
-        torch.cat([packed_weights(weight) for weight in weights]),
+        torch.cat([*map(products.pack_inner, weights), packed_weights(network.from_patches.weight)]),
         torch.cat([values.flatten() for values in biases]),
     )
 
