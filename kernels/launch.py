@@ -84,9 +84,9 @@ def as_argument(tensor: torch.Tensor, dtype: type) -> object:
     return descriptor(tensor, dtype)
 
 
-def descriptor(tensor: torch.Tensor, dtype: type) -> object:
+def descriptor(tensor: torch.Tensor, dtype: type, key: tuple[object, ...] | None = None) -> object:
     """Address and shape of a tensor as Warp passes them, from a cached one of the same shape and type."""
-    key = (tensor.shape, tensor.stride(), tensor.dtype, dtype)
+    key = key or (tensor.shape, tensor.stride(), tensor.dtype, dtype)
     like = _descriptors.get(key)
     if like is None:
         if len(_descriptors) >= MOST_DESCRIPTORS:
@@ -94,6 +94,19 @@ def descriptor(tensor: torch.Tensor, dtype: type) -> object:
         like = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
         like._ref = None  # otherwise the memory would be kept as long as the descriptor
         _descriptors[key] = like
+    made = cast(Any, type(like)).from_buffer_copy(like)
+    made.data = tensor.data_ptr()
+    return made
+
+
+def flat_argument(tensor: torch.Tensor, dtype: type) -> object:
+    """The numbers of a contiguous tensor as an argument of one dimension; otherwise as `as_argument`."""
+    if not tensor.is_contiguous() or tensor.numel() == 0:
+        return as_argument(tensor.reshape(-1), dtype)
+    key = (tensor.numel(), dtype)
+    like = _descriptors.get(key)
+    if like is None:
+        return descriptor(tensor.reshape(-1), dtype, key)
     made = cast(Any, type(like)).from_buffer_copy(like)
     made.data = tensor.data_ptr()
     return made

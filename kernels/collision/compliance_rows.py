@@ -186,20 +186,21 @@ def compliance_rows(
                     values[target[g, lane] + wp.int64(order[b + k])] = wp.float32(x[g, k][lane])
 
 
-def lines_of(system: System, factor: Factor, rows: Rows, normal: torch.Tensor) -> Lines:
+def lines_of(system: System, factor: Factor, rows: Rows, vertex_component: torch.Tensor, normal: torch.Tensor) -> Lines:
     """Makes the rows of Z that the contacts of a solve need.
 
     Args:
         system: Division of the vertices into components.
         factor: Factor of B, in the form for substitution.
         rows: The rows that are kept, to which new ones are added in place.
+        vertex_component: Component of each vertex, int32 [V].
         normal: n, float64 [V,3], zero at vertices without contact.
     """
     block, room, capacity, used, key, slot = (t.numpy() for t in rows[:6])
-    start, order = system.start.numpy(), system.rows.numpy()
-    component = np.repeat(np.arange(len(block)), np.diff(start))
-    listed = (normal.numpy() != 0).any(axis=1)[order]  # vertices sorted by component
-    owner, keys = component[listed], key[order[listed]]
+    start = system.start.numpy()
+    n = normal.numpy()
+    touching = np.flatnonzero((n[:, 0] != 0) | (n[:, 1] != 0) | (n[:, 2] != 0))
+    owner, keys = vertex_component.numpy()[touching], key[touching]
     owner, keys = owner[keys >= 0], keys[keys >= 0]
     wanted, first = np.unique(keys, return_index=True)
     of_block = block[owner[first]]

@@ -92,7 +92,7 @@ def _solve(
             forces_inverse_gpu.displace(system, dense, vertex_component, listed, normal, y, increment)
         force += y
     if factor.factored:
-        lines = lines_of(system, factor, rows, normal)
+        lines = lines_of(system, factor, rows, vertex_component, normal)
         solved = normal, gap, limit, relative, max_iterations, *results
         force += forces_inverse_cpu.solve_by_rows(system, factor, rows, lines, *solved)
         left = torch.where(lines.base < 0, factor.base, -1)

@@ -45,7 +45,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import as_argument
+from warpgarment.kernels.launch import as_argument, flat_argument
 
 from .vectors import TEXT
 
@@ -394,4 +394,4 @@ _TYPES = {torch.float32: wp.float32, torch.int32: wp.int32, torch.int64: wp.int6
 
 def argument(values: torch.Tensor) -> object:
     """A tensor as the argument of a launch, in one dimension."""
-    return as_argument(values if values.dim() == 1 else values.reshape(-1), _TYPES[values.dtype])
+    return flat_argument(values, _TYPES[values.dtype])

@@ -59,7 +59,7 @@ def test_rows_are_those_of_the_inverse():
     for count in (1, 3, 30):
         chosen = [rng.choice(len(z), count, replace=False) for z in expected]
         normal = normals(model, np.concatenate([start + part for start, part in zip(starts, chosen, strict=True)]))
-        lines = compliance_rows.lines_of(model.system, model.factor, model.rows, normal)
+        lines = compliance_rows.lines_of(model.system, model.factor, model.rows, model.vertex_component, normal)
         assert (lines.base >= 0).all()
         assert lines.base[0] == lines.base[2] != lines.base[1]
         assert lines.entries == 3 * count * (-(-count // 16) * 16)
@@ -75,11 +75,15 @@ def test_rows_do_not_depend_on_what_was_kept():
     entries = 20 * (-(-len(LARGE.vertices) // 16) * 16)
     together, single, short = model_of(LARGE), model_of(LARGE), model_of(LARGE, row_budget=entries)
     chosen = np.arange(5, 125, 6)
-    compliance_rows.lines_of(together.system, together.factor, together.rows, normals(together, chosen))
+    compliance_rows.lines_of(
+        together.system, together.factor, together.rows, together.vertex_component, normals(together, chosen)
+    )
     for vertex in chosen[::-1]:
-        compliance_rows.lines_of(single.system, single.factor, single.rows, normals(single, [vertex]))
+        compliance_rows.lines_of(
+            single.system, single.factor, single.rows, single.vertex_component, normals(single, [vertex])
+        )
     for other in (np.arange(1, 21), chosen, chosen[3:9], np.arange(40, 55), chosen):
-        compliance_rows.lines_of(short.system, short.factor, short.rows, normals(short, other))
+        compliance_rows.lines_of(short.system, short.factor, short.rows, short.vertex_component, normals(short, other))
         assert short.rows.used[0] <= 20
         assert sorted(short.rows.slot[short.rows.slot >= 0].tolist()) == list(range(int(short.rows.used[0])))
     for vertex in chosen:
@@ -102,5 +106,5 @@ def test_more_contacts_than_rows_are_solved_otherwise():
     np.testing.assert_allclose(*results, rtol=0, atol=2e-5)
     assert (results[0] - rest).abs().max() > 0.01
     model = model_of(SMALL, LARGE, row_budget=entries)
-    lines = compliance_rows.lines_of(model.system, model.factor, model.rows, contacts.normal)
+    lines = compliance_rows.lines_of(model.system, model.factor, model.rows, model.vertex_component, contacts.normal)
     assert lines.base[0] >= 0 > lines.base[1]
