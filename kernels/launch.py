@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
@@ -133,6 +132,7 @@ def launch_rows(
     device: wp.Device,
     *,
     least: int = 256,
+    even: bool = False,
 ) -> None:
     """Launches a kernel over rows that are independent of each other, on a CPU in ranges on several threads.
 
@@ -145,6 +145,7 @@ def launch_rows(
         outputs: Arguments after `inputs`.
         device: Warp's device.
         least: Number of rows that are worth the 0.1 ms that another range takes.
+        even: Whether all rows take the same time, so that a range for each thread is enough.
     """
     if not rows:
         return
@@ -152,19 +153,14 @@ def launch_rows(
         wp.launch(kernel, dim=rows, inputs=[0, *inputs, *outputs], device=device)
         return
     count = threads.count()
-    parts = min(PER_THREAD * count, rows // least) if count > 1 else 1
+    parts = min((1 if even else PER_THREAD) * count, rows // least) if count > 1 else 1
     if parts > count:
         parts -= parts % count  # three ranges on two threads would take as long as four
     if parts < 2:
         recorded.launch(kernel, rows, [0, *inputs, *outputs], device)
         return
     begins = [rows * part // parts for part in range(parts + 1)]
-    threads.spread(
-        [
-            recorded.prepared(kernel, end - begin, [begin, *inputs, *outputs], device)
-            for begin, end in itertools.pairwise(begins)
-        ]
-    )
+    threads.spread(recorded.divided(kernel, begins, [*inputs, *outputs], device))
 
 
 def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> None:

@@ -14,6 +14,7 @@ recorded on a `wp.Tape`: kernels are differentiated by operators of torch.
 from __future__ import annotations
 
 import ctypes
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -88,6 +89,32 @@ def prepared(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: 
         wp.launch(kernel, dim=rows, inputs=arguments, device=device)  # says which argument is wrong
         return lambda: None
     forward = record.forward
+    return lambda: forward(ctypes.byref(bounds), ctypes.byref(filled))
+
+
+def divided(kernel: wp.Kernel, begins: Sequence[int], arguments: Sequence[object], device: wp.Device) -> list[Launch]:
+    """Calls for ranges of rows, as of `prepared`, of a kernel whose first parameter is the first row of a launch.
+
+    Args:
+        kernel: The kernel.
+        begins: First row of each range, and the end of the last one.
+        arguments: Arguments after the first.
+        device: The CPU.
+    """
+    ranges, record = list(itertools.pairwise(begins)), _records.get(kernel)
+    try:
+        filled = None if record is None else record.filled([begins[0], *arguments])
+    except TypeError:
+        filled = None
+    if record is None or filled is None:
+        return [prepared(kernel, end - begin, [begin, *arguments], device) for begin, end in ranges]
+    return [_later(record, filled, begin, end) for begin, end in ranges]
+
+
+def _later(record: Record, like: Any, begin: int, end: int) -> Launch:
+    """The call for one range: the structure of another one with its own first row."""
+    filled, bounds, forward = record.structure.from_buffer_copy(like), record.bounds(end - begin), record.forward
+    filled.argument_0 = begin
     return lambda: forward(ctypes.byref(bounds), ctypes.byref(filled))
 
 

@@ -178,6 +178,7 @@ def _launch(kernel: wp.Kernel, faces: torch.Tensor, inputs: list[object], output
             [argument(values) for values in outputs],
             device,
             least=LEAST,
+            even=True,
         )
 
 

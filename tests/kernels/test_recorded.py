@@ -74,6 +74,23 @@ def test_launches_in_several_threads():
         np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_ranges_have_their_own_first_rows(known, monkeypatch):
+    """Ranges of a launch would all begin at the same row, the first time a kernel is launched or later."""
+    device = wp.get_device("cpu")
+    arguments, result, expected, _memory = given(0.5, True, 20)
+    if not known:
+        monkeypatch.setattr(recorded, "_records", {})
+    else:
+        launch(above, 4, arguments, device)
+        result.fill_(torch.nan)
+    calls = recorded.divided(above, [0, 3, 4, 20], arguments[1:], device)
+    assert len(calls) == 3
+    for call in reversed(calls):
+        call()
+    np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
+
+
 def test_a_block_of_a_row_is_one_lane():
     """Rows of a kernel with blocks would be counted as often as there are lanes."""
     device = wp.get_device("cpu")
