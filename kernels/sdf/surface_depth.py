@@ -14,7 +14,9 @@ an edge of the garment can still be missed.
 
 A vertex outside at a distance r from the body has a ball of that radius around it without any surface: the middles of
 edges and faces and the points c within it are outside too, and are not examined. Distances are found up to a limit of
-half an edge.
+less than an edge. A point of a triangle is no further from the nearest corner than 1/√3 of the longest edge; so the
+balls of a face whose corners are further from the body hold all of it. A vertex that moved by a small part of r since
+an earlier measurement, on a body that did not move, is still outside, with a ball that is smaller by that.
 
 | symbol | code | what |
 | --- | --- | --- |
@@ -51,6 +53,10 @@ ROOM = wp.constant(0.01001)
 """Margin of the box around a face in which its tips are [m], a little more than l."""
 ROUNDING = wp.constant(2.0e-6)
 """Lengths [m] that are in a ball by less than this are examined."""
+COVERED = wp.constant(0.57736)
+"""1/√3, and some rounding."""
+MOVED = wp.constant(0.1)
+"""Part of its ball by which a vertex may have moved since it was measured."""
 
 
 class SurfaceDepth(NamedTuple):
@@ -58,6 +64,8 @@ class SurfaceDepth(NamedTuple):
 
     garments: torch.Tensor  # of each garment's deepest point, [B]
     missing: torch.Tensor  # at each vertex, how much deeper its edges and faces are than their corners, [V]
+    depth: torch.Tensor  # of each vertex, [V]
+    clear: torch.Tensor  # radius of the ball around each vertex that holds no surface, [V]
 
 
 @wp.func
@@ -130,10 +138,11 @@ def feet_of_tips(
     # In:
     vertices: wp.array[wp.vec3],
     body_of_vertex: wp.array[wp.int32],
+    clear: wp.array[wp.float32],
     # Out:
     feet: wp.array[wp.vec3],
 ):
-    """The point c of each face, NaN where no body vertex stands out.
+    """The point c of each face, NaN where no body vertex stands out, or where it would be in a ball in any case.
 
     This is a kernel of its own, because two kinds of queries do not fit in the shared memory of a GPU.
     """
@@ -145,6 +154,9 @@ def feet_of_tips(
     x = vertices[faces[i][0]]
     y = vertices[faces[i][1]]
     z = vertices[faces[i][2]]
+    longest = wp.max(wp.length(y - x), wp.max(wp.length(z - y), wp.length(x - z)))
+    if wp.min(clear[faces[i][0]], wp.min(clear[faces[i][1]], clear[faces[i][2]])) > COVERED * longest + ROUNDING:
+        return
     normal = wp.cross(y - x, z - x)
     if not (wp.length(normal) > 0.0 and wp.isfinite(normal)):
         return
@@ -183,6 +195,9 @@ def depth_of_vertices(
     vertices: wp.array[wp.vec3],
     body_of_vertex: wp.array[wp.int32],
     limit: wp.float32,
+    measured: wp.array[wp.vec3],  # where vertices were measured before, with the next two; or empty
+    depth_before: wp.array[wp.float32],
+    clear_before: wp.array[wp.float32],
     # Out:
     depth: wp.array[wp.float32],
     clear: wp.array[wp.float32],
@@ -192,6 +207,15 @@ def depth_of_vertices(
     clear[i] = 0.0
     b = body_of_vertex[i]
     if b >= 0 and b < bodies.meshes.shape[0]:
+        if measured.shape[0] > 0:
+            moved = wp.length(vertices[i] - measured[i])
+            if moved == 0.0:
+                depth[i] = depth_before[i]
+                clear[i] = clear_before[i]
+                return
+            if moved < MOVED * clear_before[i]:
+                clear[i] = clear_before[i] - moved - ROUNDING
+                return
         found, sign, _weights, closest = closest_on_body(bodies, b, vertices[i], limit)
         if found >= 0:
             away = wp.float32(wp.length(wp.vec3d(vertices[i]) - closest))
@@ -298,6 +322,7 @@ def surface_depth(
     count: int,
     *,
     limit: float = 0.0,
+    before: tuple[torch.Tensor, SurfaceDepth] | None = None,
 ) -> SurfaceDepth:
     """Depths of a packed batch of garments; without gradients.
 
@@ -310,7 +335,9 @@ def surface_depth(
         garment_of_vertex: Garment of each vertex, int32 [V].
         count: Number of garments B.
         limit: Largest distance of vertices that is looked for [m], to leave out what is around them. It changes the
-            time only; half an edge is a good one.
+            time only; a little more than half of an edge is a good one.
+        before: Positions [V,3] at which the same vertices were measured before on the bodies where they are now, with
+            the same `body_of_vertex` or more of them on a body, and what was found. It changes the time only.
 
     Raises:
         ValueError: Wrong shape or device.
@@ -329,13 +356,21 @@ def surface_depth(
     lines, triangles = as_argument(edges, wp.vec2i), as_argument(faces, wp.vec3i)
     foot, depths, rest = (as_argument(feet, wp.vec3), *(as_argument(t, wp.float32) for t in (depth, between)))
     balls = as_argument(clear, wp.float32)
+    measured = (depth.new_empty((0, 3)), depth[:0], depth[:0])
+    if before is not None:
+        expect("measured positions", before[0], (size, 3), device=device)
+        measured = (before[0].detach(), before[1].depth, before[1].clear)
+    earlier = [
+        as_argument(values, kind) for values, kind in zip(measured, (wp.vec3, wp.float32, wp.float32), strict=True)
+    ]
     with torch_stream(device) as warp_device:
-        launch_rows(feet_of_tips, len(faces), [bodies.model, triangles, points, body], [foot], warp_device)
         found = [depths, balls]
-        launch_rows(depth_of_vertices, size, [bodies.model, points, body, float(limit)], found, warp_device)
+        inputs = [bodies.model, points, body, float(limit), *earlier]
+        launch_rows(depth_of_vertices, size, inputs, found, warp_device)
+        launch_rows(feet_of_tips, len(faces), [bodies.model, triangles, points, body, balls], [foot], warp_device)
         inputs = [bodies.model, lines, triangles, points, body, balls, foot]
         launch_rows(depth_between_vertices, len(between), inputs, [rest], warp_device)
         given = [as_argument(garment_of_vertex, wp.int32), lines, triangles, depths, rest]
         written = [as_argument(missing, wp.float32), as_argument(deepest, wp.float32)]
         launch(collect_depth, size + len(between), [*given, *written], warp_device)
-    return SurfaceDepth(deepest, missing)
+    return SurfaceDepth(deepest, missing, depth, clear)

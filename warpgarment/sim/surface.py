@@ -16,7 +16,7 @@ from warpgarment.kernels.sdf.surface_depth import SurfaceDepth, surface_depth
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
-REACH = 0.6  # of a mean edge, to which distances of vertices are looked for: a little more than half of most edges
+REACH = 0.75  # of a mean edge, to which distances of vertices are looked for: balls of that radius hold most faces
 AMPLE = 1.5  # corners are moved by this multiple of the depth between them, since a corner that is far does not follow
 
 
@@ -38,8 +38,14 @@ class Surface:
         length = (one - other).norm(dim=1)
         self._limit = REACH * float(length.mean()) if len(length) else 0.0
 
-    def depth(self, vertices: torch.Tensor, bodies: BodyMeshes, body_of_vertex: torch.Tensor) -> SurfaceDepth:
-        """Depth of vertices [V,3], edges and faces in the bodies [m], see `SurfaceDepth`."""
+    def depth(
+        self,
+        vertices: torch.Tensor,
+        bodies: BodyMeshes,
+        body_of_vertex: torch.Tensor,
+        before: tuple[torch.Tensor, SurfaceDepth] | None = None,
+    ) -> SurfaceDepth:
+        """Depth of vertices [V,3], edges and faces in the bodies [m]; `before` is that of `surface_depth`."""
         packed = self._packed
         return surface_depth(
             vertices,
@@ -50,6 +56,7 @@ class Surface:
             packed.garment_of_vertex,
             packed.count,
             limit=self._limit,
+            before=before,
         )
 
 

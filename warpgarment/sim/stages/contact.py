@@ -16,6 +16,7 @@ from warpgarment.kernels.collision.contact_set import (
 from warpgarment.kernels.collision.solver import CollisionSolver
 from warpgarment.kernels.features.carry import carried, face_at_each_vertex
 from warpgarment.kernels.sdf.bodies import BodyMeshes
+from warpgarment.kernels.sdf.surface_depth import SurfaceDepth
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.bodies import MovingBodies
 from warpgarment.sim.surface import Surface, distance_to_keep
@@ -114,9 +115,11 @@ class Contact:
             bodies, on_body, epsilon = self._bodies.at(next_body), self._body_of_vertex, self._epsilon
             pending, depth = finite, vertices.new_zeros(self._packed.count)
             report = vertices.new_zeros(3, dtype=torch.float64)
+            measured: tuple[torch.Tensor, SurfaceDepth] | None = None
             for number in range(self._passes if self._sources else 0):
                 if number:
-                    inside = self._surface.depth(vertices, bodies, on_body)
+                    inside = self._surface.depth(vertices, bodies, on_body, measured)
+                    measured = vertices, inside
                     depth = torch.where(pending, inside.garments, depth)
                     pending = finite & pending & (depth > SHALLOW)
                     if self.early_exit and not pending.any():
@@ -135,7 +138,7 @@ class Contact:
             if self._sources and self._passes:
                 vertices = self._out(vertices, bodies, pending, origin)
             if measure:
-                inside = self._surface.depth(vertices, bodies, on_body)
+                inside = self._surface.depth(vertices, bodies, on_body, measured)
                 depth = torch.where(pending, inside.garments, depth)
         return vertices, finite, depth, report
 
