@@ -37,7 +37,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from .path_search import FAR, LANES, search
 
 LANDMARKS = 6  # the distances to these nodes serve as coordinates of all nodes
-SHORT = 0.7  # edges that the order follows, in mean lengths of the edges of a node
+SHORT = 0.5  # edges that the order follows, in mean lengths of the edges of a node
 
 
 def unit_of(graph: csr_matrix) -> float:
