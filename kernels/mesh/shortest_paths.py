@@ -1,22 +1,25 @@
-"""Shortest paths from many nodes of a graph, 32 sources at a time: one scalar search, then vector sweeps.
+"""Shortest paths from many nodes of a graph, 64 sources at a time: one scalar search, then vector sweeps.
 
-Lengths are integers, multiples of a unit so small that the rounding does not matter. Sums are therefore exact: the
-result depends neither on the order of additions nor on which sources share a block, and distances are symmetric.
+Lengths are integers, multiples of a unit. Sums are therefore exact: the result depends neither on the order of
+additions nor on which sources share a block, and distances are symmetric. Every edge is rounded once, by at most half
+a unit, and the longest path has 2^28 to 2^30 units. So a distance of m edges is at most m/2 units off, m/2^29 of the
+longest. On a dress of 9,394 faces distances differ from sums in float64 by 3 nm on average and 0.12 micrometres at
+most, in float32 both: by 7e-9 of them on average, and by 4e-7 of the shortest ones.
 
-1. Dijkstra's algorithm (1959) from one source of a block lists all nodes by their distance from it.
-2. The sources of a block are neighbours, so this order nearly suits all of them. In this order, for all at once,
+1. Dijkstra's algorithm (1959) from one source of a block lists all nodes by their distance from it. Without a limit,
+   it follows short edges alone: this order need not be exact.
+2. The sources of a block are neighbours, so this order nearly suits all of them, except near them. In this order, for
+   all at once,
 
-       d_v = min(d_v, min_u d_u + w_uv)        d_v [32], one entry per source
+       d_v = min(d_v, min_u d_u + w_uv)        d_v [64], one entry per source
 
-   (Bellman 1958). A second pass visits every node again; later passes visit only neighbours of nodes that changed.
-   When no node changes, d is the fixed point: the lengths of the shortest paths.
+   (Bellman 1958): first for the nodes near the sources until none changes, with all neighbours u, then outwards with
+   those before v, and back inwards with those after v. Later passes visit neighbours of nodes that changed. When no
+   node changes, d is the fixed point: the lengths of the shortest paths.
 
-On a garment's graph of some 125 edges a node, a node is visited 2.0 to 2.2 times.
-
-| symbol | code | what |
-| --- | --- | --- |
-| w_uv | `pointer, column, length` | edge lengths, CSR, symmetric, int64, in units |
-| d_v | `distance` | [N], 32 int64 each, in units; `FAR` where a source does not reach the node |
+Nodes that follow each other in the order form groups, and are visited within a group as they lie in memory, so that
+what they read is in the cache. "Before" and "after" are those of groups; nodes of the same group are seen both ways.
+The kernels are in path_search.py.
 """
 
 from __future__ import annotations
@@ -29,199 +32,27 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import warp as wp
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
-from warpgarment.kernels import compiling
+from .path_search import FAR, LANES, search
 
-wp.set_module_options(compiling.options(enable_backward=False))
-
-LANES = 32
 LANDMARKS = 6  # the distances to these nodes serve as coordinates of all nodes
-_LANES = wp.constant(LANES)
-FAR = wp.constant(wp.int64(2**61))  # longer than any path; the sum of it and a path does not overflow
-row = wp.types.vector(LANES, wp.int64)
-
-
-@wp.func
-def rise(hole: int, node: int, heap: wp.array[wp.int32], place: wp.array[wp.int32], near: wp.array[wp.int64]):
-    """Inserts a node into the heap at a hole, or above it."""
-    at = hole
-    key = near[node]
-    going = at
-    while going > 0:
-        parent = (at - 1) / 2
-        other = heap[parent]
-        going = 0
-        if near[other] > key:
-            heap[at] = other
-            place[other] = at
-            at = parent
-            going = at
-    heap[at] = node
-    place[node] = at
-
-
-@wp.func
-def remove_top(size: int, heap: wp.array[wp.int32], place: wp.array[wp.int32], near: wp.array[wp.int64]):
-    """Fills the top of a heap, whose node was removed, with the last node, which lies at index `size`."""
-    last = heap[size]
-    key = near[last]
-    at = wp.int32(0)
-    child = wp.int32(1)
-    while child < size:
-        if child + 1 < size:
-            if near[heap[child + 1]] < near[heap[child]]:
-                child += 1
-        other = heap[child]
-        if near[other] < key:
-            heap[at] = other
-            place[other] = at
-            at = child
-            child = 2 * at + 1
-        else:
-            child = size
-    heap[at] = last
-    place[last] = at
-
-
-@wp.func
-def order_from(
-    first: int,
-    listed: int,
-    limit: wp.int64,
-    sources: wp.array[wp.int32],
-    pointer: wp.array[wp.int32],
-    column: wp.array[wp.int32],
-    length: wp.array[wp.int64],
-    heap: wp.array[wp.int32],
-    place: wp.array[wp.int32],
-    near: wp.array[wp.int64],
-    order: wp.array[wp.int32],
-):
-    """Lists nodes by distance from `first`, up to the limit around all sources; returns the number listed in all."""
-    near[first] = wp.int64(0)
-    heap[0] = first
-    place[first] = 0
-    size = wp.int32(1)
-    count = wp.int32(listed)
-    spread = FAR + wp.int64(0)  # distance of the furthest source from the first; unknown until all were met
-    while size > 0:
-        u = heap[0]
-        d = near[u]
-        if limit < FAR and spread >= FAR:
-            spread = wp.int64(0)
-            for l in range(_LANES):
-                spread = wp.max(spread, near[sources[l]])
-        if d - spread > limit:
-            size = 0
-        else:
-            order[count] = u
-            count += 1
-            size -= 1
-            if size > 0:
-                remove_top(size, heap, place, near)
-            e = pointer[u]
-            end = pointer[u + 1]
-            while e < end:
-                v = column[e]
-                through = d + length[e]
-                if through < near[v]:
-                    near[v] = through
-                    hole = place[v]
-                    if hole < 0:
-                        hole = size
-                        size += 1
-                    rise(hole, v, heap, place, near)
-                e += 1
-    return count
-
-
-@wp.kernel
-def search(
-    # Model:
-    pointer: wp.array[wp.int32],
-    column: wp.array[wp.int32],
-    length: wp.array[wp.int64],
-    targets: wp.array[wp.int32],
-    # In:
-    sources: wp.array[wp.int32],
-    lanes: int,
-    limit: wp.int64,
-    unit: wp.float64,
-    # Work:
-    heap: wp.array[wp.int32],
-    place: wp.array[wp.int32],
-    near: wp.array[wp.int64],
-    order: wp.array[wp.int32],
-    stale: wp.array[wp.int8],
-    distance: wp.array[row],
-    # Out:
-    found: wp.array2d[wp.float32],
-):
-    """Distances from a block of sources to the targets; `inf` beyond the limit. Runs in one thread."""
-    for v in range(near.shape[0]):
-        near[v] = FAR
-        place[v] = -1
-        stale[v] = wp.int8(1)
-        distance[v] = row(FAR)
-    count = wp.int32(0)
-    for l in range(_LANES):
-        s = sources[l]
-        if near[s] >= FAR:  # the first one of each component
-            count = order_from(s, count, limit, sources, pointer, column, length, heap, place, near, order)
-        own = distance[s]
-        own[l] = wp.int64(0)
-        distance[s] = own
-
-    sweep = wp.int32(0)
-    changed = wp.int32(1)
-    while changed > 0:
-        changed = wp.int32(0)
-        for k in range(count):
-            v = order[k]
-            if stale[v] != wp.int8(0):
-                stale[v] = wp.int8(0)
-                old = distance[v]
-                best = row(old)
-                e = pointer[v]
-                end = pointer[v + 1]
-                while e < end:
-                    best = wp.min(best, distance[column[e]] + row(length[e]))
-                    e += 1
-                if not (best == old):
-                    distance[v] = best
-                    changed = wp.int32(1)
-                    if sweep > 0:
-                        for e in range(pointer[v], pointer[v + 1]):
-                            stale[column[e]] = wp.int8(1)
-        if sweep == 0:
-            changed = wp.int32(1)
-            for k in range(count):
-                stale[order[k]] = wp.int8(1)
-        sweep += 1
-
-    for t in range(targets.shape[0]):
-        there = distance[targets[t]]
-        for l in range(lanes):
-            d = wp.float32(wp.inf)
-            if there[l] <= limit and there[l] < FAR:
-                d = wp.float32(wp.float64(there[l]) * unit)
-            found[l, t] = d
+SHORT = 0.5  # edges that the order follows, in mean lengths of the edges of a node
 
 
 def unit_of(graph: csr_matrix) -> float:
-    """Unit of length for a graph: a power of two, so small that no path is longer than 2^60 units.
+    """Unit of length for a graph: a power of two, so small that the longest path has 2^28 to 2^30 units.
 
     Args:
-        graph: Lengths of edges, [N,N], in any unit.
+        graph: Lengths of edges, [N,N], symmetric, in any unit.
 
     Raises:
         ValueError: A length is negative or not finite.
     """
-    longest = float(graph.data.max(initial=0.0))
-    if not (longest < np.inf and graph.data.min(initial=0.0) >= 0.0):
+    if not (graph.data.max(initial=0.0) < np.inf and graph.data.min(initial=0.0) >= 0.0):
         raise ValueError("lengths of edges must be finite and not negative")
-    return float(np.ldexp(1.0, int(np.frexp(longest * graph.shape[0])[1]) - 60))
+    longest = _longest(graph, _firsts(graph))
+    return float(np.ldexp(1.0, int(np.frexp(longest / (FAR - graph.shape[0]))[1]))) if longest else 1.0
 
 
 class Paths:
@@ -231,7 +62,7 @@ class Paths:
         graph: Lengths of edges, [N,N], symmetric, not negative, in any unit.
         targets: Nodes to which distances are computed, integers [T].
         unit: Unit to whose multiples lengths are rounded; None takes `unit_of` of this graph. Parts of a graph must
-            be given the unit of the whole graph.
+            be given the unit of the whole graph. In a part, a path longer than any of the whole graph counts as none.
 
     Raises:
         ValueError: A length is negative or not finite, and no unit is given.
@@ -245,13 +76,9 @@ class Paths:
         self.place = np.empty(self.count, np.int32)  # new number of each node
         self.place[order] = np.arange(self.count, dtype=np.int32)
         graph = graph[order][:, order]
-        self._model: list[wp.array] = [
-            wp.array(graph.indptr, dtype=wp.int32, device="cpu"),
-            wp.array(graph.indices, dtype=wp.int32, device="cpu"),
-            wp.array(np.rint(graph.data / self.unit).astype(np.int64), dtype=wp.int64, device="cpu"),
-            wp.array(self.place[targets], dtype=wp.int32, device="cpu"),
-        ]
-        self._target_count = len(targets)
+        graph.data = np.minimum(np.rint(graph.data / self.unit), FAR).astype(np.int32)
+        self._graph, self._edges = graph, _sent(graph)
+        self._targets = wp.array(self.place[targets], dtype=wp.int32, device="cpu")
 
     def distances(self, sources: np.ndarray, limit: float = np.inf, threads: int | None = None) -> np.ndarray:
         """Lengths of the shortest paths from sources to the targets.
@@ -259,46 +86,69 @@ class Paths:
         Args:
             sources: Nodes from which paths start, integers [S].
             limit: Longest path of interest, in the graph's unit of length.
-            threads: Number of host threads; None takes one for each core. A thread needs some 330 bytes a node.
+            threads: Number of host threads; None takes one for each core. A thread needs some 280 bytes a node.
 
         Returns:
             float32 [S,T], in the graph's unit of length; `inf` where no path exists within the limit.
         """
         place, points = self.place[sources], self._landmarks[sources]
-        lengths = np.empty((len(sources), self._target_count), np.float32)
-        blocks = list(neighbourhoods(points, LANES))
-        whole = wp.int64(int(min(limit / self.unit, 2.0**61)))
+        lengths = np.empty((len(sources), len(self._targets)), np.float32)
+        found = wp.array(lengths, dtype=wp.float32, device="cpu", copy=False)
+        whole = int(min(limit / self.unit, FAR - 1))
+        near = _sent(_short_edges(self._graph)) if whole == FAR - 1 else self._edges  # a limit needs exact distances
         of_thread = threading.local()
 
         def run(block: np.ndarray) -> None:
             if not hasattr(of_thread, "work"):
-                kinds = wp.int32, wp.int32, wp.int64, wp.int32, wp.int8, row
+                kinds = wp.int32, wp.int32, wp.int32, wp.int32, wp.int32, wp.int8
                 of_thread.work = [wp.empty(self.count, dtype=kind, device="cpu") for kind in kinds]
-                of_thread.lengths = np.empty((LANES, self._target_count), np.float32)
+                of_thread.work.append(_aligned(LANES * self.count))
             middle = np.argmin(((points[block] - points[block].mean(axis=0)) ** 2).sum(axis=1))
             block = np.roll(block, -middle)  # the order of nodes is that of the first source
             padded = np.concatenate([place[block], np.repeat(place[block[:1]], LANES - len(block))])
-            wp.launch(
-                search,
-                dim=1,
-                inputs=[
-                    *self._model,
-                    wp.array(padded, dtype=wp.int32, device="cpu"),
-                    len(block),
-                    whole,
-                    self.unit,
-                    *of_thread.work,
-                ],
-                outputs=[wp.array(of_thread.lengths, dtype=wp.float32, device="cpu", copy=False)],
-                device="cpu",
-            )
-            lengths[block] = of_thread.lengths[: len(block)]
+            own = [wp.array(nodes, dtype=wp.int32, device="cpu") for nodes in (padded, block)]
+            inputs = [*self._edges, *near, self._targets, *own, whole, self.unit, *of_thread.work]
+            wp.launch(search, dim=1, inputs=inputs, outputs=[found], device="cpu")
 
+        blocks = list(neighbourhoods(points, LANES))
         for block in blocks[:1]:  # before the others, since it may have to compile the kernel
             run(block)
         with ThreadPoolExecutor(threads or usable_cores()) as pool:  # launches release the global interpreter lock
             list(pool.map(run, blocks[1:]))
         return lengths
+
+
+def _sent(graph: csr_matrix) -> list[wp.array]:
+    """A graph of int32 lengths as arguments of a kernel, which share its memory."""
+    return [wp.array(a, dtype=wp.int32, device="cpu", copy=False) for a in (graph.indptr, graph.indices, graph.data)]
+
+
+def _short_edges(graph: csr_matrix) -> csr_matrix:
+    """The short edges of a graph of int32 lengths, in doubled units; all edges if short ones make paths too long."""
+    degree = np.diff(graph.indptr)
+    row = np.repeat(np.arange(len(degree)), degree)
+    mean = SHORT * np.bincount(row, weights=graph.data, minlength=len(degree)) / np.maximum(degree, 1)
+    short = graph.data <= np.maximum(mean[row], mean[graph.indices])
+    starts = np.concatenate([[0], np.cumsum(np.bincount(row[short], minlength=len(degree)))])
+    part = csr_matrix((graph.data[short] // 2, graph.indices[short], starts), shape=graph.shape)
+    return part if _longest(part, _firsts(graph)) < FAR else graph
+
+
+def _firsts(graph: csr_matrix) -> np.ndarray:
+    """The first node of each connected piece, [C]."""
+    return np.unique(connected_components(graph, directed=False)[1], return_index=True)[1]
+
+
+def _longest(graph: csr_matrix, firsts: np.ndarray) -> float:
+    """A bound of all distances within pieces, twice the largest from their first nodes; inf if these miss a node."""
+    return 2.0 * float(dijkstra(graph, indices=firsts, min_only=True).max())
+
+
+def _aligned(count: int) -> wp.array:
+    """An int32 array that begins at a multiple of 64 bytes, as the vectors of a search do."""
+    memory = np.empty(count + 16, np.int32)
+    begin = -memory.ctypes.data % 64 // 4
+    return wp.array(memory[begin : begin + count], dtype=wp.int32, device="cpu", copy=False)
 
 
 def neighbourhoods(points: np.ndarray, size: int) -> Iterator[np.ndarray]:

@@ -44,7 +44,7 @@ CROSSED_REACH = 1.5
 SADDLE = 1e-3  # angle beyond 2 pi from which a vertex can bend a shortest path [rad]
 BLOCK = 512  # number of sources of one search of local distances
 FEW = 8  # for fewer sources, preparing a graph for the faster search takes longer than it saves
-VERSION = 3  # raise it whenever the result changes: it is part of the name under which results are kept
+VERSION = 4  # raise it whenever the result changes: it is part of the name under which results are kept
 MEMORY_BUDGET = 8 * 2**30  # largest matrix of float32 distances [bytes]: about 46,000 faces
 
 
@@ -57,7 +57,8 @@ def face_geodesics(rest_vertices: Any, faces: Any) -> np.ndarray:
 
     Returns:
         Distances [m], float32, shape [F,F]; zero diagonal, symmetric, `inf` across components. Never shorter than the
-        exact polyhedral distance, and within 5 % of it except as said above.
+        exact polyhedral distance, up to rounding (`kernels/mesh/shortest_paths.py`: some nanometres on a garment), and
+        within 5 % of it except as said above.
 
     Raises:
         MeshError: Bad shapes or indices, positions that are not finite, non-manifold edges, faces without area, or a
@@ -176,8 +177,8 @@ def distances_from(graph: csr_matrix, sources: np.ndarray, face_count: int) -> n
         face_count: Number of faces F.
 
     Returns:
-        Distances [m], float32, shape [S,F]. For fewer than `FEW` sources they are sums of float64, and may differ in
-        the last bit from those for more sources.
+        Distances [m], float32, shape [S,F]. For fewer than `FEW` sources they are sums of float64, and may differ by
+        some nanometres from those for more sources, whose lengths are rounded to units.
     """
     if len(sources) < FEW:
         return dijkstra(graph, indices=sources)[:, :face_count].astype(np.float32)

@@ -33,7 +33,7 @@ CENTRES = 4096  # largest number of centres; D_c takes 64 MiB
 NEAR = 12  # number of centres from which a face is interpolated
 NEAR_REACH, CHAIN_REACH = 3.0, 6.0  # largest distance of these, and of links between centres, in fill distances
 LARGEST_ROW = 6.0  # sum of absolute entries of a row of P, beyond which it is replaced by a plain mean
-VERSION = 2  # raise it whenever the result changes: it is part of the name under which results are kept
+VERSION = 3  # raise it whenever the result changes: it is part of the name under which results are kept
 
 
 class PooledGeodesics(NamedTuple):

@@ -40,9 +40,11 @@ def graph_of(name):
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("share", [0.1, 0.5, np.inf])
 def test_same_lengths_as_scipy(name, share):
-    """Paths would be missed, or end before the limit. Lengths are rounded to 2^-59 of the longest path, so only the
-    rounding to float32 is left (relative 6e-8); the limit lies between two distances."""
+    """Paths would be missed, or end before the limit, which lies between two distances. With lengths that are rounded
+    to units before, only the rounding to float32 is left (relative 6e-8)."""
     graph, count = graph_of(name)
+    unit = shortest_paths.unit_of(graph)
+    graph.data = unit * np.rint(graph.data / unit)
     sources = np.random.default_rng(0).permutation(count)[:70]
     whole = distances(graph, sources)[:, :count]
     limit = np.inf
@@ -57,6 +59,34 @@ def test_same_lengths_as_scipy(name, share):
     np.testing.assert_allclose(found, expected, rtol=6.1e-8)
 
 
+@pytest.mark.parametrize("name", MESHES)
+def test_rounding_to_units_is_lost_in_that_to_float32(name):
+    """Distances would be coarser than promised: half a unit an edge, where the longest path has at least 2^28 units.
+
+    SciPy's sums in float64 are the reference. No path here has more than a hundred edges; on average roundings of
+    edges cancel, and less is left than the rounding of float32.
+    """
+    graph, count = graph_of(name)
+    unit = shortest_paths.unit_of(graph)
+    expected = distances(graph, np.arange(count))[:, :count]
+    reached = np.isfinite(expected)
+    if name != "one face":
+        assert 2.0**28 < expected[reached].max() / unit < 2.0**30
+    found = Paths(graph, np.arange(count)).distances(np.arange(count))
+    np.testing.assert_allclose(found, expected, rtol=6.1e-8, atol=50 * unit)
+    assert np.abs(found[reached] - expected[reached]).mean() <= 3e-8 * expected[reached].mean()
+
+
+def test_the_order_of_nodes_changes_no_bit(monkeypatch):
+    """Nodes would be lost where the short edges, which the order follows, do not reach them."""
+    graph, count = graph_of("pieces")
+    every = np.arange(count)
+    whole = Paths(graph, every).distances(every)
+    for share in (0.0, 0.3):
+        monkeypatch.setattr(shortest_paths, "SHORT", share)
+        np.testing.assert_array_equal(Paths(graph, every).distances(every), whole)
+
+
 def test_random_graphs_far_from_a_surface():
     """The order of nodes would matter: sources anywhere, edges that do not follow any geometry, some of no length."""
     random = np.random.default_rng(5)
@@ -69,7 +99,7 @@ def test_random_graphs_far_from_a_surface():
     expected = distances(graph, np.arange(500))
     assert np.isinf(expected).any()
     found = Paths(graph, np.arange(500)).distances(np.arange(500))
-    np.testing.assert_allclose(found, expected, rtol=6.1e-8, atol=1e-15)
+    np.testing.assert_allclose(found, expected, rtol=6.1e-8, atol=50 * shortest_paths.unit_of(graph))
 
 
 def test_sources_threads_and_blocks_change_no_bit(monkeypatch):
