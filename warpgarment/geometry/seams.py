@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from .checks import directed_edges, repeated_vertices
 
@@ -84,6 +83,8 @@ def coinciding_borders(vertices: np.ndarray, faces: np.ndarray) -> Seams:
         vertices: Positions [m], shape [V,3]; those that faces name are finite.
         faces: Vertex indices in range, shape [F,3].
     """
+    from scipy.spatial import cKDTree  # where it is used: a rollout starts a tenth of a second earlier
+
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     faces = faces[~repeated_vertices(faces)]
     group, size = np.arange(len(vertices)), len(vertices)
@@ -187,6 +188,8 @@ def _earlier(rows: np.ndarray) -> np.ndarray:
 
 def _between(vertices: np.ndarray, border: np.ndarray, tolerance: float) -> np.ndarray:
     """Vertices of open edges [E,2] that lie on another of them, away from both its ends, bool [V]."""
+    from scipy.spatial import cKDTree
+
     result = np.zeros(len(vertices), dtype=bool)
     on_border = np.unique(border)
     if len(on_border) == 0:
