@@ -1,7 +1,8 @@
 """Turns a Warp kernel with one thread per row into a differentiable torch operator.
 
 The operator (`registered.py`) has a fake implementation, so `torch.compile` and `torch.export` accept
-it; its backward is a second custom operator that launches the kernel's adjoint. Tensors go in and out without copies.
+it; its backward is a second custom operator that launches the kernel's adjoint, or a kernel of its own. Tensors go in and
+out without copies.
 """
 
 from __future__ import annotations
