@@ -61,7 +61,9 @@ class FrameCounts:
     def __init__(self, scene, now, next_body: torch.Tensor) -> None:
         self.launches: Counter[str] = Counter()
         early, scene.contact.early_exit = scene.contact.early_exit, False
-        looks, scene.meet.early_exit = scene.meet.early_exit, False
+        looks = scene.meet is not None and scene.meet.early_exit
+        if scene.meet is not None:
+            scene.meet.early_exit = False
         made = [(wp, "launch"), (wp, "launch_tiled"), (recorded, "prepared")]
         patches = [mock.patch.object(where, name, self._counted(getattr(where, name))) for where, name in made]
         patches.append(mock.patch.object(stages.finite, "READ_ON", frozenset()))  # as on a GPU
@@ -85,7 +87,8 @@ class FrameCounts:
             for patch in patches:
                 patch.stop()
             scene.contact.early_exit = early
-            scene.meet.early_exit = looks
+            if scene.meet is not None:
+                scene.meet.early_exit = looks
         self.operators = seen.counts
         # Sizes of the compliance matrices are on the host.
         self.reads = [name for name, tensor in seen.read if tensor.dtype != torch.int64 or tensor.numel() != 1]

@@ -47,11 +47,10 @@ def apart(name: str) -> wp.Module:
 
 
 OF_A_FRAME = (
-    "sdf.surface_depth",
-    "features.frame",
-    "sdf.closest",
+    "sdf.searches",
     "collision.forces_inverse_cpu",
     "collision.body_contacts",
+    "sdf.surface_depth",
     "sdf.tree",
     "mesh.windows",
     "deformation.replaced_eight",

@@ -1,7 +1,8 @@
 """Turns a Warp kernel with one thread per row into a differentiable torch operator.
 
 The operator (`registered.py`) has a fake implementation, so `torch.compile` and `torch.export` accept
-it; its backward is a second custom operator that launches the kernel's adjoint. Tensors go in and out without copies.
+it; its backward is a second custom operator that launches the kernel's adjoint, or a kernel of its own. Tensors go in and
+out without copies.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ def row_operator(
     *,
     rows: str,
     gradients: Sequence[str] = (),
+    backward: wp.Kernel | None = None,
 ) -> Callable[..., Any]:
     """Registers `warpgarment::name`, an operator that runs `kernel` once per row.
 
@@ -58,6 +60,8 @@ def row_operator(
         outputs: Name, Warp element type and row shape of each result, in the kernel's order.
         rows: Name of the input whose length is the number of rows.
         gradients: Names of the inputs that gradients flow to.
+        backward: Kernel that takes the inputs, then the gradients of the results, and writes those of these inputs;
+            None for the adjoint that Warp derives.
 
     Returns:
         The operator. It takes tensors in the order of `inputs` and returns one tensor, or a tuple of several. It does
@@ -92,11 +96,17 @@ def row_operator(
     if not wanted:
         return operator
 
-    def backward(*tensors: torch.Tensor) -> Any:
+    def pulled(*tensors: torch.Tensor) -> Any:
         arguments, incoming = tensors[: len(names)], tensors[len(names) :]
         results = [torch.zeros(arguments[i].shape, dtype=torch.float32, device=arguments[i].device) for i in wanted]
         at = arguments[row_index]
         if at.shape[0] == 0:
+            return unpacked(results)
+        if backward is not None:
+            given = [*zip(arguments, types, strict=True), *zip(incoming, kinds, strict=True)]
+            launch(
+                backward, at.shape[0], given, [(r, types[i]) for r, i in zip(results, wanted, strict=True)], at.device
+            )
             return unpacked(results)
         adjoints: list[wp.array | None] = [None] * len(names)
         for i, gradient in zip(wanted, results, strict=True):
@@ -122,7 +132,7 @@ def row_operator(
         return unpacked([torch.empty(tensors[i].shape, device=tensors[i].device) for i in wanted])
 
     received = names + [f"grad_{n}" for n in outputs]
-    backward_operator = Operator(f"warpgarment::{name}_backward", backward, _schema(received, len(wanted)))
+    backward_operator = Operator(f"warpgarment::{name}_backward", pulled, _schema(received, len(wanted)))
     backward_operator.register_fake(fake_backward)
 
     def save(ctx: Any, inputs: tuple[torch.Tensor, ...], output: Any) -> None:

@@ -49,6 +49,32 @@ for name in ["kernels", "kernels.sdf.BodyMeshes", *warpgarment.__all__]:
     assert _fresh(code) == ""
 
 
+def test_a_rollout_loads_no_more_than_it_needs():
+    """It would start later, and take more memory: readers of motion capture, SciPy's trees, the kernels of layers and
+    of physics, and torch's compiler are for others."""
+    code = """
+import sys, warpgarment as wg
+assets = wg.demo.assets()
+dress = assets.garments["dress"]
+sim = wg.Simulator.from_pretrained("fast", device="cpu")
+sim.rollout(dress.garment, assets.collider, first_vertices=dress.first_vertices, frames=2)
+print(*sys.modules)
+"""
+    loaded = set(_fresh(code).split())
+    assert "warpgarment.kernels.collision.solver" in loaded
+    heavy = {"scipy.spatial", "scipy.special", "warpgarment.kernels.cloth", "warpgarment.kernels.physics",
+             "warpgarment.bodies.moved", "torch._dynamo"}  # fmt: skip
+    assert not loaded & heavy
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_imports_leave_the_garbage_collector_as_it_was(on):
+    """A program would run without collections ever after, or with those that it has switched off; and objects from
+    before the import would never be collected."""
+    code = f"import gc, warpgarment as wg; {'gc.enable()' if on else 'gc.disable()'}; wg.Simulator;"
+    assert _fresh(f"{code} print(gc.isenabled(), gc.get_freeze_count())") == f"{on} 0"
+
+
 def test_version_is_that_of_the_installed_package():
     """A bug report, or a cache, would hold the version of something else, or none."""
     assert _fresh("import warpgarment; print(warpgarment.__version__)") == version("warpgarment") != ""

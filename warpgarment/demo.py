@@ -103,6 +103,8 @@ def assets(folder: str | Path | None = None) -> DemoAssets:
     """
     folder = Path(folder) if folder is not None else ASSETS
     body = BodyMotion.load(folder / "body.npz", collider=False)
+    collides = read_npz(folder / "body.npz", wanted=lambda name: name == "collider_faces").get("collider_faces")
+    collider = body if collides is None else body.submesh(collides)
     garments = {}
     for name in GARMENTS:
         path = folder / f"{name}.npz"
@@ -113,7 +115,7 @@ def assets(folder: str | Path | None = None) -> DemoAssets:
             raise MeshError(f"{path}: {truth.frames} frames of ground truth, the body has {body.frames}")
         garments[name] = DemoGarment(garment, truth)
     outfit = _outfit(folder / "outfit.npz", body.fps) if (folder / "outfit.npz").exists() else None
-    return DemoAssets(body, BodyMotion.load(folder / "body.npz"), garments, outfit)
+    return DemoAssets(body, collider, garments, outfit)
 
 
 def _outfit(path: Path, fps: float) -> DemoOutfit:

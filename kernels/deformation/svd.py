@@ -165,23 +165,6 @@ def rotation_of(m: wp.mat33d):
 
 
 @wp.func
-def singular_values_of(phi: wp.mat33):
-    """Singular values, descending and not negative."""
-    _u, sigma, _v = svd(wp.mat33d(phi))
-    return wp.vec3(wp.vec3d(sigma[0], sigma[1], wp.abs(sigma[2])))
-
-
-@wp.func_grad(singular_values_of)
-def adj_singular_values_of(phi: wp.mat33, adj_ret: wp.vec3):
-    """dσ_i = u_iᵀ dΦ v_i contains no quotient, so repeated singular values do no harm."""
-    u, sigma, v = svd(wp.mat33d(phi))
-    g = wp.vec3d(adj_ret)
-    if sigma[2] < wp.float64(0.0):
-        g = wp.vec3d(g[0], g[1], -g[2])
-    wp.adjoint[phi] += wp.mat33(u * wp.diag(g) * wp.transpose(v))
-
-
-@wp.func
 def frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33):
     """Singular values, descending, of Φ = Q Q_rest⁻¹ with Q = [e1, e2, n]; the formulas are those of the module."""
     zero = wp.float64(0.0)
@@ -224,14 +207,6 @@ def adj_frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33, adj_ret: wp.v
 
 
 @wp.func
-def with_singular_values(phi: wp.mat33, values: wp.vec3):
-    """U diag(|values|) Vᵀ with proper rotations U and V of phi."""
-    u, _sigma, v = svd(wp.mat33d(phi))
-    s = wp.vec3d(values)
-    return wp.mat33(u * wp.diag(wp.vec3d(wp.abs(s[0]), wp.abs(s[1]), wp.abs(s[2]))) * wp.transpose(v))
-
-
-@wp.func
 def bounded_quotient(numerator: wp.float64, denominator: wp.float64):
     """numerator / denominator for denominator >= 0, limited to ±MAX_GAIN; 0 / 0 is 0."""
     if numerator == wp.float64(0.0):
@@ -241,24 +216,7 @@ def bounded_quotient(numerator: wp.float64, denominator: wp.float64):
     return numerator / denominator
 
 
-@wp.func_grad(with_singular_values)
-def adj_with_singular_values(phi: wp.mat33, values: wp.vec3, adj_ret: wp.mat33):
-    """The map from P to T in the module's docstring is its own transpose, so the adjoint uses it unchanged."""
-    u, sigma, v = svd(wp.mat33d(phi))
-    g = wp.transpose(u) * wp.mat33d(adj_ret) * v
-    s = wp.vec3d(values)
-    m = wp.mat33d()
-    for i in range(3):
-        for j in range(i + 1, 3):
-            together = bounded_quotient(wp.abs(s[i]) - wp.abs(s[j]), sigma[i] - sigma[j]) * (g[i, j] + g[j, i])
-            against = bounded_quotient(wp.abs(s[i]) + wp.abs(s[j]), sigma[i] + sigma[j]) * (g[i, j] - g[j, i])
-            m[i, j] = wp.float64(0.5) * (together + against)
-            m[j, i] = wp.float64(0.5) * (together - against)
-    wp.adjoint[phi] += wp.mat33(u * m * wp.transpose(v))
-    wp.adjoint[values] += wp.vec3(wp.vec3d(wp.sign(s[0]) * g[0, 0], wp.sign(s[1]) * g[1, 1], wp.sign(s[2]) * g[2, 2]))
-
-
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def singular_values_kernel(
     # In:
     phi: wp.array[wp.mat33],
@@ -266,10 +224,28 @@ def singular_values_kernel(
     values: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    values[i] = singular_values_of(phi[i])
+    _u, sigma, _v = svd(wp.mat33d(phi[i]))
+    values[i] = wp.vec3(wp.vec3d(sigma[0], sigma[1], wp.abs(sigma[2])))
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
+def singular_values_gradient_kernel(
+    # In:
+    phi: wp.array[wp.mat33],
+    grad_values: wp.array[wp.vec3],
+    # Out:
+    grad_phi: wp.array[wp.mat33],
+):
+    """dσ_i = u_iᵀ dΦ v_i contains no quotient, so repeated singular values do no harm."""
+    i = wp.tid()
+    u, sigma, v = svd(wp.mat33d(phi[i]))
+    g = wp.vec3d(grad_values[i])
+    if sigma[2] < wp.float64(0.0):
+        g = wp.vec3d(g[0], g[1], -g[2])
+    grad_phi[i] = wp.mat33(u * wp.diag(g) * wp.transpose(v))
+
+
+@wp.kernel(enable_backward=False)
 def replace_singular_values_kernel(
     # In:
     phi: wp.array[wp.mat33],
@@ -277,8 +253,37 @@ def replace_singular_values_kernel(
     # Out:
     replaced: wp.array[wp.mat33],
 ):
+    """U diag(|values|) Vᵀ with proper rotations U and V of phi."""
     i = wp.tid()
-    replaced[i] = with_singular_values(phi[i], values[i])
+    u, _sigma, v = svd(wp.mat33d(phi[i]))
+    s = wp.vec3d(values[i])
+    replaced[i] = wp.mat33(u * wp.diag(wp.vec3d(wp.abs(s[0]), wp.abs(s[1]), wp.abs(s[2]))) * wp.transpose(v))
+
+
+@wp.kernel(enable_backward=False)
+def replace_singular_values_gradient_kernel(
+    # In:
+    phi: wp.array[wp.mat33],
+    values: wp.array[wp.vec3],
+    grad_replaced: wp.array[wp.mat33],
+    # Out:
+    grad_phi: wp.array[wp.mat33],
+    grad_values: wp.array[wp.vec3],
+):
+    """The map from P to T in the module's docstring is its own transpose, so the gradient uses it unchanged."""
+    n = wp.tid()
+    u, sigma, v = svd(wp.mat33d(phi[n]))
+    g = wp.transpose(u) * wp.mat33d(grad_replaced[n]) * v
+    s = wp.vec3d(values[n])
+    m = wp.mat33d()
+    for i in range(3):
+        for j in range(i + 1, 3):
+            together = bounded_quotient(wp.abs(s[i]) - wp.abs(s[j]), sigma[i] - sigma[j]) * (g[i, j] + g[j, i])
+            against = bounded_quotient(wp.abs(s[i]) + wp.abs(s[j]), sigma[i] + sigma[j]) * (g[i, j] - g[j, i])
+            m[i, j] = wp.float64(0.5) * (together + against)
+            m[j, i] = wp.float64(0.5) * (together - against)
+    grad_phi[n] = wp.mat33(u * m * wp.transpose(v))
+    grad_values[n] = wp.vec3(wp.vec3d(wp.sign(s[0]) * g[0, 0], wp.sign(s[1]) * g[1, 1], wp.sign(s[2]) * g[2, 2]))
 
 
 @wp.kernel(enable_backward=False)
@@ -300,6 +305,7 @@ _singular_values = row_operator(
     {"values": (wp.vec3, (3,))},
     rows="phi",
     gradients=["phi"],
+    backward=singular_values_gradient_kernel,
 )
 _replace_singular_values = row_operator(
     "replace_singular_values",
@@ -308,6 +314,7 @@ _replace_singular_values = row_operator(
     {"replaced": (wp.mat33, (3, 3))},
     rows="phi",
     gradients=["phi", "values"],
+    backward=replace_singular_values_gradient_kernel,
 )
 
 

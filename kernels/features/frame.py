@@ -9,20 +9,17 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warpgarment.kernels import compiling
 from warpgarment.kernels.deformation.gradients import expect_mesh
 from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.closest import Bodies
+from warpgarment.kernels.sdf.closest import SEARCHES, Bodies
 
 from .channels import FEATURES
 from .face import face_and_mean, nearest_motion, write_features
 
-wp.set_module_options(compiling.options())
 
-
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=SEARCHES)
 def frame_features_kernel(
     from_row: wp.int32,
     # Model:

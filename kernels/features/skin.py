@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from warpgarment.kernels.deformation.svd import rotation
 
@@ -101,6 +100,8 @@ def bind(
         body_offsets: First vertex of each body, and U at the end.
         device: Device of the result.
     """
+    from scipy.spatial import cKDTree  # where it is used: a rollout starts a tenth of a second earlier
+
     vertices, body = np.asarray(vertices, np.float64), np.asarray(body, np.float64)
     points, offset = np.zeros((len(vertices), BOUND), np.int64), np.zeros((len(vertices), BOUND, 3))
     weight, around, count = np.zeros((len(vertices), BOUND)), [], 0

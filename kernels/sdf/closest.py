@@ -26,6 +26,8 @@ from .tree_rays import crossings_by_tree
 from .tree_search import nearest_by_tree, on_cpu
 
 wp.set_module_options(compiling.options())
+SEARCHES = compiling.apart("warpgarment.kernels.sdf.searches")
+"""The module of all kernels that search closest points: the search, two seconds of the compiler, is compiled once."""
 
 MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its square is still a finite float32
 # Bodies in pieces: distance, in radii, from which a group of faces is summed as one. On closed bodies 1, 2 and 3 give
@@ -153,7 +155,7 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
     return named, sign, wp.vec3(weights), weights[0] * p + weights[1] * q + weights[2] * r
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=SEARCHES)
 def query_bodies_kernel(
     from_row: wp.int32,
     # Model:

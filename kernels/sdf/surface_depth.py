@@ -39,7 +39,7 @@ from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows,
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import BEYOND, Bodies, closest_on_body, has_tree
+from .closest import BEYOND, SEARCHES, Bodies, closest_on_body, has_tree
 from .nearest_face import closest_on_triangle
 from .tree import Tree
 from .tree_boxes import boxes_in_box, triangles_above
@@ -186,7 +186,7 @@ def feet_of_tips(
     feet[i] = foot
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=SEARCHES)
 def depth_of_vertices(
     from_row: wp.int32,
     # Model:
@@ -235,7 +235,7 @@ def in_a_ball(point: wp.vec3, x: wp.vec3, y: wp.vec3, z: wp.vec3, radius: wp.vec
     )
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module=SEARCHES)
 def depth_between_vertices(
     from_row: wp.int32,
     # Model:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.meshes import irregular_grid
+from warpgarment.geometry import seams
 from warpgarment.geometry.clean import clean_mesh
 from warpgarment.geometry.seams import SHARE, coinciding_borders
 
@@ -146,3 +147,19 @@ def test_a_mesh_with_two_sides_is_cleaned_to_one():
     assert (len(cleaned.vertices), len(cleaned.faces)) == (len(sheet.vertices), len(sheet.faces))
     assert cleaned.dropped == len(sheet.faces)
     assert f"{len(sheet.faces)} of {2 * len(sheet.faces)} faces are dropped" in cleaned.message("it")
+
+
+def test_few_and_many_vertices_are_joined_alike(monkeypatch):
+    """A garment with a few vertices more on its borders would be joined in another way: pairs of few are all looked at,
+    and a tree is asked for those of many."""
+    vertices, faces = irregular_grid(8, 5)
+    rng = np.random.default_rng(0)
+    apart = vertices[faces].reshape(-1, 3) + rng.normal(size=(3 * len(faces), 3)) * 0.01 * np.ptp(vertices) / 8
+    both = []
+    for few in (0, 10_000):
+        monkeypatch.setattr(seams, "FEW", few)
+        both.append(coinciding_borders(apart, np.arange(len(apart)).reshape(-1, 3)))
+    one, other = both
+    np.testing.assert_array_equal(one.group, other.group)
+    assert one[1:] == other[1:]
+    assert 0 < len(np.unique(one.group)) < len(apart)

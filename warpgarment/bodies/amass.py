@@ -102,16 +102,6 @@ def read_amass(path: str | Path, up: str = "z") -> Clip:
     )
 
 
-def is_amass(path: str | Path) -> bool:
-    """Whether an .npz holds joint angles, and no positions; False for a file that is no archive."""
-    try:
-        with open_plain(Path(path)) as file, zipfile.ZipFile(file) as archive:
-            names = set(archive.namelist())
-    except _UNREADABLE:
-        return False
-    return {"poses.npy", "trans.npy"} <= names and "vertices.npy" not in names
-
-
 def read_recorded(path: str | Path) -> Recorded:
     """Reads what an AMASS file holds, in its own axes.
 

@@ -1,9 +1,16 @@
-"""BVH files as moving bodies."""
+"""BVH files as moving bodies. What reads them is loaded for those alone."""
 
 from __future__ import annotations
 
-from warpgarment.io.data import Format
+from pathlib import Path
 
-from .moved import from_bvh
+from warpgarment.io.data import Format, MotionData, ReadOptions
 
-FORMAT = Format(read_motion=from_bvh, axis=True, bones=True)
+
+def _read(path: Path, options: ReadOptions) -> MotionData:
+    from .moved import from_bvh
+
+    return from_bvh(path, options)
+
+
+FORMAT = Format(read_motion=_read, axis=True, bones=True)

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from .checks import directed_edges, repeated_vertices
 
@@ -26,6 +25,9 @@ SHARE = 0.05
 MOST, ANYWAY = 12, 4_000_000
 """Vertices near each vertex, on average, beyond which nothing is joined unless there are fewer in all. Where all
 triangles are apart, 6 are at each place."""
+FEW = 500
+"""Vertices on borders up to which all pairs of them are looked at. A tree for more of them is SciPy's, which takes a
+tenth of a second to load."""
 PATIENCE = 5
 """Rounds in which single vertices are taken out of what is to be joined, before all at their place are."""
 
@@ -95,10 +97,10 @@ def coinciding_borders(vertices: np.ndarray, faces: np.ndarray) -> Seams:
     on_border = np.unique(border)
     if len(on_border) == 0:
         return Seams(group, tolerance, 0, 0)
-    tree = cKDTree(vertices[on_border])
-    if tree.count_neighbors(tree, tolerance) > max(MOST * len(on_border), ANYWAY):
+    pairs = _pairs_within(vertices[on_border], tolerance)
+    if pairs is None:
         return Seams(group, tolerance, len(on_border), 0)
-    found = on_border[tree.query_pairs(tolerance, output_type="ndarray").reshape(-1, 2)]
+    found = on_border[pairs]
     label = _connected(size, _wanted(vertices, found, border, keys))
     wanted = np.bincount(label)[label] > 1
     label = _manifold(vertices, faces, label)
@@ -109,6 +111,37 @@ def coinciding_borders(vertices: np.ndarray, faces: np.ndarray) -> Seams:
     open_still = group[directed_edges(faces)[first[count == 1]]]
     apart, between = wanted & ~joined, _between(vertices, open_still, tolerance)
     return Seams(group, tolerance, int(np.count_nonzero(apart)), int(np.count_nonzero(between & ~wanted)))
+
+
+def _pairs_within(points: np.ndarray, distance: float) -> np.ndarray | None:
+    """Pairs of points that are at most so far from each other, int64 [P,2]; None if too many are."""
+    if len(points) <= FEW:
+        near = np.linalg.norm(points[:, None] - points, axis=2) <= distance
+        return np.argwhere(np.triu(near, 1))
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    if tree.count_neighbors(tree, distance) > max(MOST * len(points), ANYWAY):
+        return None
+    return np.asarray(tree.query_pairs(distance, output_type="ndarray").reshape(-1, 2), np.int64)
+
+
+def _found_within(points: np.ndarray, centres: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Balls [E,3], [E] and points that are in them, two int64 [P]; None if there are too many in a ball on average."""
+    if len(points) <= FEW:
+        near = np.linalg.norm(points - centres[:, None], axis=2) <= reach[:, None]
+        if near.sum(axis=1).mean() > 4 * MOST:
+            return None
+        ball, point = np.nonzero(near)
+        return ball, point
+    from scipy.spatial import cKDTree
+
+    tree, some = cKDTree(points), slice(None, None, 1 + len(centres) // 1000)
+    if tree.query_ball_point(centres[some], reach[some], return_length=True).mean() > 4 * MOST:
+        return None
+    found = tree.query_ball_point(centres, reach)
+    ball = np.repeat(np.arange(len(centres)), [len(inside) for inside in found])
+    return ball, np.concatenate([*found, []]).astype(np.int64)
 
 
 def _keys(pairs: np.ndarray, count: int) -> np.ndarray:
@@ -191,16 +224,13 @@ def _between(vertices: np.ndarray, border: np.ndarray, tolerance: float) -> np.n
     on_border = np.unique(border)
     if len(on_border) == 0:
         return result
-    tree = cKDTree(vertices[on_border])
     start, along = vertices[border[:, 0]], vertices[border[:, 1]] - vertices[border[:, 0]]
     length = np.linalg.norm(along, axis=1)
     middle, reach = start + 0.5 * along, 0.5 * length + tolerance
-    some = slice(None, None, 1 + len(border) // 1000)
-    if tree.query_ball_point(middle[some], reach[some], return_length=True).mean() > 4 * MOST:
+    found = _found_within(vertices[on_border], middle, reach)
+    if found is None:
         return result
-    near = tree.query_ball_point(middle, reach)
-    edge = np.repeat(np.arange(len(border)), [len(found) for found in near])
-    vertex = on_border[np.concatenate([*near, []]).astype(np.int64)]
+    edge, vertex = found[0], on_border[found[1]]
     other = (vertex != border[edge, 0]) & (vertex != border[edge, 1])
     edge, vertex = edge[other], vertex[other]
     close = np.minimum(tolerance, SHARE * length[edge])

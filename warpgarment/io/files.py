@@ -59,14 +59,15 @@ def has_bones(path: Path) -> bool:
 
 def suffixes(ability: Ability) -> list[str]:
     """Suffixes of the formats that can do something, in the order of `FORMATS`; a mesh is read as a motion too."""
-    found = []
-    for every in FORMATS:
-        format = format_of(every[0])
-        assert format is not None
-        able = getattr(format, ability) or (ability == "read_motion" and format.read_mesh)
-        if able:
-            found += [s for s in every if ability.startswith("read") or s not in format.only_read]
-    return found
+    return [suffix for every in FORMATS for suffix in _able(every, ability)]
+
+
+def _able(every: tuple[str, ...], ability: Ability) -> list[str]:
+    """Those of the suffixes of a format with which it can do something."""
+    format = format_of(every[0])
+    assert format is not None
+    able = getattr(format, ability) or (ability == "read_motion" and format.read_mesh)
+    return [s for s in every if ability.startswith("read") or s not in format.only_read] if able else []
 
 
 def listed(names: Sequence[str]) -> str:
@@ -242,8 +243,9 @@ def _reader(path: Path, ability: Literal["read_mesh", "read_motion"], options: R
         raise FileNotFoundError(f"No such file: {path}")
     if not path.is_dir():
         check_plain(path)
-    suffix, able = "" if path.is_dir() else path.suffix.lower(), suffixes(ability)
-    if suffix in able and (suffix or path.is_dir()):
+    suffix = "" if path.is_dir() else path.suffix.lower()
+    every = next((every for every in FORMATS if suffix in every), None)
+    if every and suffix in _able(every, ability) and (suffix or path.is_dir()):
         format = _alike(path, suffix) if ability == "read_motion" else None
         format = format or format_of(suffix)
         assert format is not None
@@ -251,7 +253,9 @@ def _reader(path: Path, ability: Literal["read_mesh", "read_motion"], options: R
             unnamed(path, options.mesh)
         return format
     kind = "a folder" if path.is_dir() else suffix or "files without a suffix"
-    raise MeshError(f"{path}: cannot read {kind}{' as a mesh' if ability == 'read_mesh' else ''}; use {listed(able)}.")
+    raise MeshError(
+        f"{path}: cannot read {kind}{' as a mesh' if ability == 'read_mesh' else ''}; use {listed(suffixes(ability))}."
+    )
 
 
 def _alike(path: Path, suffix: str) -> Format | None:

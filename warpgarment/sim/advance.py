@@ -23,10 +23,11 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     solved, finite = scene.reconstruct(before, step, features, next_body)
     solved = scene.relax(solved, finite)
     origin = scene.contact.origin(before, features)
-    meets = scene.meet.on
-    pushed, finite, depth, report = scene.contact(solved, next_body, finite & now.finite, origin, measure=not meets)
+    pushed, finite, depth, report = scene.contact(
+        solved, next_body, finite & now.finite, origin, measure=scene.meet is None
+    )
     meeting = now.meeting
-    if meets:
+    if scene.meet is not None:
         pushed, meeting, deep = scene.meet(before, pushed, features, next_body, finite, origin)
         depth = torch.where(finite, deep, depth)
     after, finite, depth = scene.correct(before, pushed, next_body, finite, depth)

@@ -10,6 +10,10 @@ from warpgarment.nn.inputs import Frames
 
 from .history import History
 
+FIGURES = 4
+"""Columns of the figures of cloth that meets cloth: crossing pairs with other garments, with itself, lag [m], pairs not
+looked at."""
+
 
 class Frame(NamedTuple):
     """One frame of a batch. All of it is on the device, so that the next frame can be computed without the host."""
@@ -23,7 +27,7 @@ class Frame(NamedTuple):
     solves: (
         torch.Tensor
     )  # float64 [2,3]: for Poisson and collisions, iterations, number of stopped components, their largest error
-    meeting: torch.Tensor  # [B,4] figures of cloth that meets cloth, see `stages.meet.FIGURES`; NaN for no outfit
+    meeting: torch.Tensor  # [B,4] figures of cloth that meets cloth, see `FIGURES`; NaN for no outfit
 
     previous: torch.Tensor  # [2,V,3] positions at t-1 and t-2 [m]; [0,V,3] if the network does not read them
     previous_body: torch.Tensor  # [2,U,3] the same of the bodies; or [0,U,3]

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 
 from warpgarment.errors import NotEnoughMemory
-from warpgarment.kernels.cloth.pairs import PARTNERS
 from warpgarment.kernels.collision import compliance, compliance_rows
 from warpgarment.kernels.features.channels import FEATURES
 from warpgarment.kernels.linear import factor
@@ -39,7 +38,6 @@ from .history import copies
 USABLE = 0.9  # share of the free memory that a prediction may fill
 PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
 PER_BODY_FACE, PER_BODY_VERTEX = 240, 60  # bytes of Warp's tree and of ours; of two positions
-PER_MEETING_FACE = PARTNERS * (4 + 3 * 12) + 200  # bytes of pairs and their directions, and of boxes and a tree
 GRAPHED = 3  # copies of the history on a GPU: of a state, and the input and output of a graph
 INVERTING = 3, 2  # number of float64 matrices while the compliance of a component is made, on a GPU and on a CPU
 LANES = 16  # rows of compliance matrices are padded to a multiple of this
@@ -122,7 +120,7 @@ def predict(
             "history of features": int(histories * 4 * config.history * FEATURES * faces),
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
             "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * relaxes,
-            "pairs of layers": PER_MEETING_FACE * sum(len(garments[i].faces) for outfit in layers for i in outfit),
+            "pairs of layers": _pairs([len(garments[i].faces) for outfit in layers for i in outfit]),
             "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
             peak: passing[peak],
         }
@@ -196,6 +194,15 @@ def check(
         f"{len(garments):,} garments need {needed}. That is more than {_size(limit)}, {USABLE:.0%} of what is free on "
         f"{device}. {remedy}"
     )
+
+
+def _pairs(faces: Sequence[int]) -> int:
+    """Bytes of pairs of faces and their directions, and of boxes and a tree, of outfits with garments of that many."""
+    if not faces:
+        return 0
+    from warpgarment.kernels.cloth.pairs import PARTNERS  # loads kernels that only outfits launch
+
+    return (PARTNERS * (4 + 3 * 12) + 200) * sum(faces)
 
 
 def _factors(garments: Sequence[Garment], cpu: bool) -> int:

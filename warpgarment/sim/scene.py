@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from contextlib import nullcontext
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -32,17 +33,19 @@ from warpgarment.sim.stages.centroids import ComponentCentroids
 from warpgarment.sim.stages.contact import Contact
 from warpgarment.sim.stages.correct import Correct, Corrector
 from warpgarment.sim.stages.features import Features
-from warpgarment.sim.stages.meet import Meet
 from warpgarment.sim.stages.reconstruct import Reconstruct
 from warpgarment.sim.stages.relax import Relax
 
 from . import memory
 from .bodies import MovingBodies
 from .brought import Brought
-from .frame import Frame
+from .frame import FIGURES, Frame
 from .history import Stacks
 from .surface import Surface
 from .timing import Timings
+
+if TYPE_CHECKING:
+    from warpgarment.sim.stages.meet import Meet
 
 GIVEN = frozenset({"previous", "materials", "wind", "skin"})  # optional inputs of networks that simulations have
 FARTHEST = 1.0  # metres; a garment whose nearest vertex is farther from its body has a wrong position or unit
@@ -161,7 +164,11 @@ class Scene:
             passes=collision_passes,
             timings=timings,
         )
-        self.meet = Meet(packed, layers, first_vertices, self.contact, timings)
+        self.meet: Meet | None = None  # of garments of no outfit
+        if layers:
+            from warpgarment.sim.stages.meet import Meet  # with its kernels, which other simulations do without
+
+            self.meet = Meet(packed, layers, first_vertices, self.contact, timings)
         self.correct = Correct(self.correctors, packed, self.contact.depth, timings)
 
     def _refuse_far(self, vertices: torch.Tensor, body_of_vertex: torch.Tensor) -> None:
@@ -177,6 +184,17 @@ class Scene:
                     "metres (Garment.load(..., unit=...)) and Y up, and bring the garment onto the first frame with "
                     "wg.dress (--dress), or with wg.fit (--fit-rest) if it was modelled on this body."
                 )
+
+    def measure_meeting(self, vertices: torch.Tensor, finite: torch.Tensor) -> torch.Tensor:
+        """Figures of cloth that meets cloth, shape [B,4]: of `Meet.measure`, or NaN without an outfit.
+
+        Args:
+            vertices: Positions [m], shape [V,3].
+            finite: Which garments are simulated, bool [B].
+        """
+        if self.meet is None:
+            return vertices.new_full((self.packed.count, FIGURES), torch.nan)
+        return self.meet.measure(vertices, finite)
 
     def inputs(self, now: Frame, features: torch.Tensor | Frames, next_body: torch.Tensor) -> FrameInputs:
         """What the network gets of a frame.

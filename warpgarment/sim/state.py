@@ -97,7 +97,7 @@ def starting_states(
             finite,
             depth,
             unsolved,
-            scene.meet.measure(vertices, finite),
+            scene.measure_meeting(vertices, finite),
             previous=_stacked([known[k] for k in past], vertices),
             previous_body=_stacked([bodies[k] for k in past], body),
             wind=_stacked(blown, air[0]),

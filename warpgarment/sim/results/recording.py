@@ -69,7 +69,7 @@ def seen(scene: Scene, outcome: tuple[torch.Tensor, ...], body: torch.Tensor) ->
 
 
 def _met(figures: np.ndarray) -> dict[str, Any]:
-    """Crossing pairs and lag of a garment as `RolloutStatus` has them, from its row of `stages.meet.FIGURES`."""
+    """Crossing pairs and lag of a garment as `RolloutStatus` has them, from its row of `frame.FIGURES`."""
     layers, itself, lag, unseen = figures
     counted = unseen == 0  # not for NaN
     return {

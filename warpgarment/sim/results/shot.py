@@ -115,7 +115,7 @@ def brought_to_shot(
         body = _tensor(shown, pending.device)
         moved, finite, depth, report = scene.contact(cloth, body, pending)
         solves = torch.stack([torch.zeros_like(report), report])
-        tensors = (moved, finite, depth, solves, scene.meet.measure(moved, finite))
+        tensors = (moved, finite, depth, solves, scene.measure_meeting(moved, finite))
         outcome = read(scene, frame, [seen(scene, tensors, body)])[0]
         for i in np.flatnonzero(moving):
             found[i].vertices[frame], found[i].status[frame] = outcome.parts[i], outcome.statuses[i]

@@ -32,6 +32,7 @@ from warpgarment.kernels.cloth.parting import parted
 from warpgarment.kernels.cloth.steps import Steps, safe_steps
 from warpgarment.kernels.features.carry_together import carried_together
 from warpgarment.objects.pack import PackedGarments
+from warpgarment.sim.frame import FIGURES
 from warpgarment.sim.timing import Timings
 
 from .contact import Contact
@@ -56,8 +57,6 @@ SMOOTH, AFFINE = 0.2, 1.0e6
 """Reaches [m] of the motions that carry an outfit: the usual one, and one by which nothing can begin to cross."""
 CELL = 0.08
 """Side of the cells [m] of which each gives one face whose motion carries the garments."""
-FIGURES = 4
-"""Columns of the figures of a frame: crossing pairs with other garments, with itself, lag [m], pairs not looked at."""
 
 
 class Meet:
@@ -65,13 +64,12 @@ class Meet:
 
     Args:
         packed: The batch.
-        layers: Garments of each outfit, innermost first, as numbers in the batch; none twice.
+        layers: Garments of each outfit, at least one, innermost first, as numbers in the batch; none twice.
         first_vertices: Positions in the first frame [m], shape [V,3].
         contact: Contact with the body.
         timings: Times of the stages, to which this one adds its own as "layers".
 
     Attributes:
-        on: Whether there is any outfit. Otherwise the stage does nothing.
         early_exit: Whether the host looks if another motion, step or round is needed. On a GPU all are done.
     """
 
@@ -84,12 +82,10 @@ class Meet:
         timings: Timings,
     ) -> None:
         self._packed, self._contact, self._timings = packed, contact, timings
-        self._count, self.on = len(layers), bool(layers)
+        self._count = len(layers)
         device = packed.faces.device
         self.early_exit = device.type == "cpu"
         self._unmeasured = torch.full((packed.count, FIGURES), torch.nan, device=device)
-        if not self.on:
-            return
         outfit, rank = np.full(packed.count, -1, np.int32), np.full(packed.count, -1, np.int32)
         for number, garments in enumerate(layers):
             outfit[list(garments)] = number
@@ -233,8 +229,6 @@ class Meet:
 
     def measure(self, vertices: torch.Tensor, finite: torch.Tensor) -> torch.Tensor:
         """Figures [B,4] of positions [m], shape [V,3], without moving them."""
-        if not self.on:
-            return self._unmeasured
         with self._timings("layers"):
             self._pairs.find(vertices, vertices, finite)
             return self._figures(vertices, self._no_normal, self._unmeasured[:, 2])

@@ -20,14 +20,17 @@ networks can be trained with the stage, past it.
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from warpgarment.kernels.physics import ImplicitSolver, PhysicsCloth, Sheet
 from warpgarment.objects.material import Material
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.timing import Timings
+
+if TYPE_CHECKING:
+    from warpgarment.kernels.physics import PhysicsCloth, Sheet
 
 MEMORY = 6
 """Pairs of the quasi-Newton method; more than there are iterations are of no use."""
@@ -63,6 +66,8 @@ class Relax:
         self.cloth: PhysicsCloth | None = None
         if not self.on:
             return
+        from warpgarment.kernels.physics import ImplicitSolver, PhysicsCloth  # most simulations do without
+
         rest, faces = packed.rest_vertices.cpu().numpy(), packed.faces.cpu().numpy()
         held = np.zeros(len(rest), bool)
         held[packed.pins.cpu().numpy()] = True
@@ -102,6 +107,8 @@ class Relax:
 
 def sheets_of(materials: torch.Tensor | None, count: int) -> list[Sheet]:
     """The cloth of each garment from the fields of `Material`, [B,M], or the default material."""
+    from warpgarment.kernels.physics import Sheet
+
     default = Material()
     names = [field.name for field in fields(Material)]
     rows = [[np.nan] * len(names)] * count if materials is None else materials.cpu().tolist()
