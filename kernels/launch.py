@@ -169,6 +169,21 @@ def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp
         recorded.launch(kernel, rows, arguments, device)
 
 
+def launch_adjoint(
+    kernel: wp.Kernel, rows: int, arguments: Sequence[object], adjoints: Sequence[object], device: wp.Device
+) -> None:
+    """Launches the adjoint of a kernel over rows; on a CPU by the record of its first launch, on one thread.
+
+    Args:
+        kernel, rows, arguments, device: As of `launch`; results are written again.
+        adjoints: The adjoint of each argument, to which those of inputs are added; None for one that is a constant.
+    """
+    if not device.is_cpu:
+        wp.launch(kernel, dim=rows, inputs=arguments, adj_inputs=adjoints, adjoint=True, device=device)
+    elif rows:
+        recorded.adjoint(kernel, rows, arguments, adjoints, device)
+
+
 def launch_tiled(
     kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device, *, block_dim: int
 ) -> None:

@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
-from warpgarment.kernels.launch import as_argument, launch_rows, launch_tiled, torch_stream
+from warpgarment.kernels.launch import as_argument, launch, launch_rows, launch_tiled, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System, block_dim
-from warpgarment.kernels.operator import allocate, unpack
+from warpgarment.kernels.operator import allocate, made_of, unpack
 from warpgarment.kernels.registered import operator
 
 from .kernels import phi_adjoint, place, place_adjoint, right_hand_side
@@ -47,6 +48,10 @@ class Matrix(NamedTuple):
 
 
 def _views(model: list[torch.Tensor]) -> dict[str, object]:
+    return made_of(model, _made_views)
+
+
+def _made_views(model: list[torch.Tensor]) -> dict[str, object]:
     tensors = _named(model)
     return {name: as_argument(tensors[name], dtype) for name, dtype in MODEL if dtype is not None}
 
@@ -83,6 +88,10 @@ def _named(model: list[torch.Tensor]) -> dict[str, torch.Tensor]:
 
 def matrix_of(model: list[torch.Tensor]) -> Matrix:
     """The matrix, taken from the tensors of a solver."""
+    return made_of(model, _made_matrix)
+
+
+def _made_matrix(model: list[torch.Tensor]) -> Matrix:
     return unpack(model[len(MODEL) :], Matrix)
 
 
@@ -189,10 +198,10 @@ def poisson_solve_backward(
     if count == 0:
         return grad_phi, grad_mean, mean.new_empty((0, 3))
     with torch_stream(mean.device) as device:
-        wp.launch_tiled(
+        launch_tiled(
             place_adjoint,
-            dim=[count],
-            inputs=[
+            count,
+            [
                 *_start_rows(model),
                 m["kind"],
                 m["centroid_weight"],
@@ -200,22 +209,22 @@ def poisson_solve_backward(
                 as_argument(rhs, wp.vec3d),
                 as_argument(grad_mean, wp.vec3),
             ],
+            device,
             block_dim=block_dim(mean.device, len(rhs), count),
-            device=device,
         )
         exactly = torch.zeros_like(tensors["tolerance"])
         adjoint, _, _ = _solve(model, rhs, exactly, ADJOINT_TOLERANCE, max_iterations)
-        wp.launch(
+        launch(
             phi_adjoint,
-            dim=len(grad_phi),
-            inputs=[
+            len(grad_phi),
+            [
                 m["rest_vertices"],
                 m["faces"],
                 m["half_cotangent"],
                 as_argument(adjoint, wp.vec3d),
                 as_argument(grad_phi, wp.float32),
             ],
-            device=device,
+            device,
         )
     pins = tensors["pins"]
     grad_pins = (tensors["pin_stiffness"][pins, None] * adjoint[pins]).to(torch.float32)
@@ -232,6 +241,37 @@ def _(
         torch.empty_like(mean, memory_format=torch.contiguous_format),
         mean.new_empty((tensors["pins"].shape[0], 3)),
     )
+
+
+def solved(
+    phi: torch.Tensor,
+    mean: torch.Tensor,
+    pin_target: torch.Tensor,
+    initial: torch.Tensor,
+    model: list[torch.Tensor],
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`poisson_solve` past torch's dispatcher, which takes a millisecond for the list of a solver."""
+    if torch.is_grad_enabled() and (phi.requires_grad or mean.requires_grad or pin_target.requires_grad):
+        result: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Solve.apply(
+            phi, mean, pin_target, initial, model, max_iterations
+        )
+        return result
+    return poisson_solve.function(phi, mean, pin_target, initial, model, max_iterations)
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *given: Any) -> tuple[torch.Tensor, ...]:
+        _, ctx.mean, _, _, ctx.model, ctx.max_iterations = given
+        output: tuple[torch.Tensor, ...] = poisson_solve.function(*given)
+        ctx.mark_non_differentiable(*output[1:])
+        return output
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor, *_: None) -> tuple[Any, ...]:
+        return *poisson_solve_backward.function(gradient, ctx.mean, ctx.model, ctx.max_iterations), None, None, None
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:

@@ -254,7 +254,7 @@ def test_operator_passes_opcheck():
     query = bodies.query(vertices)
     normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
     limit = torch.full((1,), 1e-6, dtype=torch.float64)
-    arguments = (vertices, normals, closest, EPSILON, limit, solver_for(rest)._model, 100)
+    arguments = (vertices, normals, closest, EPSILON, limit, list(solver_for(rest)._model), 100)
     torch.library.opcheck(torch.ops.warpgarment.collision_solve, arguments)
 
 
