@@ -79,18 +79,18 @@ def as_argument(tensor: torch.Tensor, dtype: type) -> object:
     """
     if not tensor.is_contiguous():
         return as_warp(tensor, dtype)
-    if tensor.numel() == 0:
-        tensor = tensor.new_empty(tensor.shape)  # see as_warp
     return descriptor(tensor, dtype)
 
 
 def descriptor(tensor: torch.Tensor, dtype: type) -> object:
-    """Address and shape of a tensor as Warp passes them, from a cached one of the same shape and type."""
-    key = (tensor.shape, tensor.stride(), tensor.dtype, dtype)
+    """Address and shape of a contiguous tensor as Warp passes them, from a cached one of the same shape and type."""
+    key = (tensor.shape, tensor.dtype, dtype)
     like = _descriptors.get(key)
     if like is None:
         if len(_descriptors) >= MOST_DESCRIPTORS:
             _descriptors.clear()
+        if tensor.numel() == 0:
+            tensor = tensor.new_empty(tensor.shape)  # see as_warp
         like = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
         like._ref = None  # otherwise the memory would be kept as long as the descriptor
         _descriptors[key] = like

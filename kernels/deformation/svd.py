@@ -36,12 +36,15 @@ first axis:
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate, row_operator
+from warpgarment.kernels.registered import operator
 
 wp.set_module_options(compiling.options())
 
@@ -241,9 +244,12 @@ def bounded_quotient(numerator: wp.float64, denominator: wp.float64):
     return numerator / denominator
 
 
-@wp.func_grad(with_singular_values)
-def adj_with_singular_values(phi: wp.mat33, values: wp.vec3, adj_ret: wp.mat33):
-    """The map from P to T in the module's docstring is its own transpose, so the adjoint uses it unchanged."""
+@wp.func
+def pulled_back(phi: wp.mat33, values: wp.vec3, adj_ret: wp.mat33):
+    """Gradients of `with_singular_values` with respect to phi and the values.
+
+    The map from P to T in the module's docstring is its own transpose, so the adjoint uses it unchanged.
+    """
     u, sigma, v = svd(wp.mat33d(phi))
     g = wp.transpose(u) * wp.mat33d(adj_ret) * v
     s = wp.vec3d(values)
@@ -254,8 +260,8 @@ def adj_with_singular_values(phi: wp.mat33, values: wp.vec3, adj_ret: wp.mat33):
             against = bounded_quotient(wp.abs(s[i]) + wp.abs(s[j]), sigma[i] + sigma[j]) * (g[i, j] - g[j, i])
             m[i, j] = wp.float64(0.5) * (together + against)
             m[j, i] = wp.float64(0.5) * (together - against)
-    wp.adjoint[phi] += wp.mat33(u * m * wp.transpose(v))
-    wp.adjoint[values] += wp.vec3(wp.vec3d(wp.sign(s[0]) * g[0, 0], wp.sign(s[1]) * g[1, 1], wp.sign(s[2]) * g[2, 2]))
+    of_values = wp.vec3d(wp.sign(s[0]) * g[0, 0], wp.sign(s[1]) * g[1, 1], wp.sign(s[2]) * g[2, 2])
+    return wp.mat33(u * m * wp.transpose(v)), wp.vec3(of_values)
 
 
 @wp.kernel
@@ -269,16 +275,35 @@ def singular_values_kernel(
     values[i] = singular_values_of(phi[i])
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def replace_singular_values_kernel(
+    from_row: wp.int32,
     # In:
     phi: wp.array[wp.mat33],
     values: wp.array[wp.vec3],
     # Out:
     replaced: wp.array[wp.mat33],
 ):
-    i = wp.tid()
+    i = from_row + wp.tid()
     replaced[i] = with_singular_values(phi[i], values[i])
+
+
+@wp.kernel(enable_backward=False)
+def replace_adjoint_kernel(
+    from_row: wp.int32,
+    # In:
+    phi: wp.array[wp.mat33],
+    values: wp.array[wp.vec3],
+    adj_replaced: wp.array[wp.mat33],
+    # Out:
+    adj_phi: wp.array[wp.mat33],
+    adj_values: wp.array[wp.vec3],
+):
+    """The adjoint with one decomposition; Warp's own would make the result anew first."""
+    i = from_row + wp.tid()
+    of_phi, of_values = pulled_back(phi[i], values[i], adj_replaced[i])
+    adj_phi[i] = of_phi
+    adj_values[i] = of_values
 
 
 @wp.kernel(enable_backward=False)
@@ -301,14 +326,51 @@ _singular_values = row_operator(
     rows="phi",
     gradients=["phi"],
 )
-_replace_singular_values = row_operator(
-    "replace_singular_values",
-    replace_singular_values_kernel,
-    {"phi": wp.mat33, "values": wp.vec3},
-    {"replaced": (wp.mat33, (3, 3))},
-    rows="phi",
-    gradients=["phi", "values"],
-)
+
+
+@operator("warpgarment::replace_singular_values")
+def _replace_singular_values(phi: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    replaced = allocate(phi.shape, torch.float32, phi.device)
+    with torch_stream(phi.device) as device:
+        given = [as_argument(phi, wp.mat33), as_argument(values, wp.vec3)]
+        launch_rows(replace_singular_values_kernel, len(phi), given, [as_argument(replaced, wp.mat33)], device)
+    return replaced
+
+
+@_replace_singular_values.register_fake
+def _(phi: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    return phi.new_empty(phi.shape)
+
+
+@operator("warpgarment::replace_singular_values_backward")
+def _replace_adjoint(
+    phi: torch.Tensor, values: torch.Tensor, gradient: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    gradient = gradient.contiguous()
+    of_phi = allocate(phi.shape, torch.float32, phi.device)
+    of_values = allocate(values.shape, torch.float32, phi.device)
+    with torch_stream(phi.device) as device:
+        given = [as_argument(phi, wp.mat33), as_argument(values, wp.vec3), as_argument(gradient, wp.mat33)]
+        found = [as_argument(of_phi, wp.mat33), as_argument(of_values, wp.vec3)]
+        launch_rows(replace_adjoint_kernel, len(phi), given, found, device)
+    return of_phi, of_values
+
+
+@_replace_adjoint.register_fake
+def _(phi: torch.Tensor, values: torch.Tensor, gradient: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return phi.new_empty(phi.shape), values.new_empty(values.shape)
+
+
+def _save(ctx: Any, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    found = _replace_adjoint(*ctx.saved_tensors, gradient)
+    return tuple(part if wanted else None for part, wanted in zip(found, ctx.needs_input_grad, strict=True))
+
+
+_replace_singular_values.register_autograd(_backward, setup_context=_save)
 
 
 def singular_values(phi: torch.Tensor) -> torch.Tensor:
@@ -340,7 +402,8 @@ def replace_singular_values(phi: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
     """
     expect("phi", phi, (None, 3, 3))
     expect("s", s, (phi.shape[0], 3), device=phi.device)
-    return _replace_singular_values(phi, s)
+    replaced: torch.Tensor = _replace_singular_values(phi, s)
+    return replaced
 
 
 def rotation(phi: torch.Tensor) -> torch.Tensor:
@@ -354,7 +417,7 @@ def rotation(phi: torch.Tensor) -> torch.Tensor:
     """
     expect("phi", phi, (None, 3, 3))
     if phi.requires_grad and torch.is_grad_enabled():
-        return _replace_singular_values(phi, phi.new_ones(phi.shape[:2]))
+        return replace_singular_values(phi, phi.new_ones(phi.shape[:2]))
     phi = phi.detach()
     turn = allocate(phi.shape, torch.float32, phi.device)
     with torch_stream(phi.device) as device:

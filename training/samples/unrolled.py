@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgarment.kernels.deformation.stretch import stretch
 from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.kept import Kept, keeping
 from warpgarment.nn.architecture import architecture
@@ -44,6 +45,7 @@ class UnrolledBatch:
     features: torch.Tensor  # [F,34] at frame t
     bodies: list[torch.Tensor]  # K+1 tensors [U,3], bodies at frames t..t+K
     recorded: list[torch.Tensor]  # K tensors [V,3], recorded positions at frames t+1..t+K
+    stretched: list[tuple[torch.Tensor, torch.Tensor]]  # their deformation gradients [F,3,3] and singular values [F,3]
     air: list[torch.Tensor]  # K tensors [B,3], velocity of the air at frames t+1..t+K [m/s]
     turn: torch.Tensor  # [B,3,3] rotation of the world for the network
     joint: torch.Tensor  # [B,3,3] the part of that rotation that the rest pose shares
@@ -160,6 +162,7 @@ class UnrolledBuilder:
             features=features[:, -1].contiguous(),
             bodies=placed[1:],
             recorded=recorded,
+            stretched=[stretch(scene.inverse_rest, frame, scene.packed.faces) for frame in recorded],
             air=[
                 torch.stack([data.air[t + k] for (_, t), data in zip(picks, mine, strict=True)])
                 for k in range(1, self.steps + 1)
