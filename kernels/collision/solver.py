@@ -237,9 +237,7 @@ class CollisionSolver:
             anchor, distance = anchor + distance[:, None] * normal, 0.0
         if first:
             self._normal = normal
-        vertices, report, error = solved(
-            vertices, normal, anchor, distance, limit, self._model, self.max_iterations
-        )
+        vertices, report, error = solved(vertices, normal, anchor, distance, limit, self._model, self.max_iterations)
         self._progress.record(report, error, self.max_iterations, add=not first)
         return vertices
 

@@ -1,6 +1,6 @@
 """Deformation gradients of known frames and their singular values in one launch, without gradients.
 
-    Φ = Q Q_rest⁻¹,   Σ its singular values, by the closed form of svd.py for such products
+Φ = Q Q_rest⁻¹,   Σ its singular values, by the closed form of svd.py for such products
 """
 
 from __future__ import annotations

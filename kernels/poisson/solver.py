@@ -210,9 +210,7 @@ class PoissonSolver:
                 raise ValueError(f"the solver has {len(self.pins)} pins; pass pin_targets [{len(self.pins)}, 3]")
             pin_targets = mean.new_empty((0, 3))
         expect("pin_targets", pin_targets, (len(self.pins), 3), device=device)
-        vertices, report, error = solved(
-            phi, mean, pin_targets, initial.detach(), self._model, self.max_iterations
-        )
+        vertices, report, error = solved(phi, mean, pin_targets, initial.detach(), self._model, self.max_iterations)
         self._progress.record(report, error, self.max_iterations)
         return vertices
 

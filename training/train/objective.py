@@ -152,7 +152,7 @@ class Trainer:
             found[number] = losses.detach(), *gradients
 
         calls = [partial(work, number) for number in range(len(batch))]
-        if threads.count() > len(calls) or not self._worked:  # then torch's own threads; kernels are loaded in this one
+        if not self._worked:  # kernels are loaded in one thread
             for call in calls:
                 call()
         else:

@@ -14,6 +14,7 @@ import torch
 from tqdm import tqdm
 
 from warpgarment.io.npz import write_npz
+from warpgarment.kernels import threads
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.faces.grow import untrained
@@ -84,8 +85,9 @@ class Run:
         elif steps > 1:
             chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
             ahead = 0  # the solvers of a scene must stay in one thread
-            if self.device.type == "cpu" and group.size == 1 and not (config.noise.features or network.config.dropout):
-                parts = config.batch_size  # threads share garments, none of which draws random numbers
+            random = config.noise.features or network.config.dropout
+            if group.size == 1 and self.device.type == "cpu" and not random:
+                parts = config.batch_size if 1 < threads.count() <= config.batch_size else 1  # garments are shared
         self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part, parts)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(

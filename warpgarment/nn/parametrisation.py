@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import torch
 
-from warpgarment.kernels.deformation.svd import rotation
+from warpgarment.kernels.deformation.replaced import rotation
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT
 
 

@@ -10,7 +10,7 @@ import torch
 
 from warpgarment.kernels import kept
 from warpgarment.kernels.deformation.next_frame import next_gradients
-from warpgarment.kernels.deformation.svd import replace_singular_values
+from warpgarment.kernels.deformation.replaced import replace_singular_values
 from warpgarment.kernels.features.channels import LAYOUT
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
