@@ -30,6 +30,7 @@ class Kept:
 
     def __init__(self, most: int = 2**28) -> None:
         self.most, self.bytes = most, 0
+        self._lock = threading.Lock()
         self._results: OrderedDict[bytes, Any] = OrderedDict()
 
     def __len__(self) -> int:
@@ -37,14 +38,17 @@ class Kept:
 
     def get(self, key: bytes, make: Callable[[], Any]) -> Any:
         """The result with this key, made if there is none."""
-        if key in self._results:
-            self._results.move_to_end(key)
-            return self._results[key]
+        with self._lock:
+            if key in self._results:
+                self._results.move_to_end(key)
+                return self._results[key]
         result = make()
-        self._results[key] = result
-        self.bytes += bytes_of(result)
-        while self.bytes > self.most:
-            self.bytes -= bytes_of(self._results.popitem(last=False)[1])
+        with self._lock:
+            if key not in self._results:  # another thread may have made it, too
+                self._results[key] = result
+                self.bytes += bytes_of(result)
+            while self.bytes > self.most:
+                self.bytes -= bytes_of(self._results.popitem(last=False)[1])
         return result
 
 

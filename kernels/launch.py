@@ -78,18 +78,18 @@ def as_argument(tensor: torch.Tensor, dtype: type) -> object:
     """
     if not tensor.is_contiguous():
         return as_warp(tensor, dtype)
-    if tensor.numel() == 0:
-        tensor = tensor.new_empty(tensor.shape)  # see as_warp
     return descriptor(tensor, dtype)
 
 
 def descriptor(tensor: torch.Tensor, dtype: type, key: tuple[object, ...] | None = None) -> object:
-    """Address and shape of a tensor as Warp passes them, from a cached one of the same shape and type."""
-    key = key or (tensor.shape, tensor.stride(), tensor.dtype, dtype)
+    """Address and shape of a contiguous tensor as Warp passes them, from a cached one of the same shape and type."""
+    key = key or (tensor.shape, tensor.dtype, dtype)
     like = _descriptors.get(key)
     if like is None:
         if len(_descriptors) >= MOST_DESCRIPTORS:
             _descriptors.clear()
+        if tensor.numel() == 0:
+            tensor = tensor.new_empty(tensor.shape)  # see as_warp
         like = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
         like._ref = None  # otherwise the memory would be kept as long as the descriptor
         _descriptors[key] = like
@@ -176,6 +176,21 @@ def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp
         wp.launch(kernel, dim=rows, inputs=arguments, device=device)
     elif rows:
         recorded.launch(kernel, rows, arguments, device)
+
+
+def launch_adjoint(
+    kernel: wp.Kernel, rows: int, arguments: Sequence[object], adjoints: Sequence[object], device: wp.Device
+) -> None:
+    """Launches the adjoint of a kernel over rows; on a CPU by the record of its first launch, on one thread.
+
+    Args:
+        kernel, rows, arguments, device: As of `launch`; results are written again.
+        adjoints: The adjoint of each argument, to which those of inputs are added; None for one that is a constant.
+    """
+    if not device.is_cpu:
+        wp.launch(kernel, dim=rows, inputs=arguments, adj_inputs=adjoints, adjoint=True, device=device)
+    elif rows:
+        recorded.adjoint(kernel, rows, arguments, adjoints, device)
 
 
 def launch_tiled(

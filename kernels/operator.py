@@ -1,8 +1,8 @@
 """Turns a Warp kernel with one thread per row into a differentiable torch operator.
 
 The operator (`registered.py`) has a fake implementation, so `torch.compile` and `torch.export` accept
-it; its backward is a second custom operator that launches the kernel's adjoint, or a kernel of its own. Tensors go in and
-out without copies.
+it; its backward is a second custom operator that launches the kernel's adjoint, or a kernel of its own. Tensors go in
+and out without copies.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_type_hints
 import torch
 import warp as wp
 
-from .launch import as_argument, as_warp, torch_stream
+from .launch import as_argument, launch_adjoint, torch_stream
 from .launch import launch as run
 from .registered import Operator
 
@@ -108,24 +108,17 @@ def row_operator(
                 backward, at.shape[0], given, [(r, types[i]) for r, i in zip(results, wanted, strict=True)], at.device
             )
             return unpacked(results)
-        adjoints: list[wp.array | None] = [None] * len(names)
+        adjoints: list[object] = [None] * len(names)
         for i, gradient in zip(wanted, results, strict=True):
-            adjoints[i] = as_warp(gradient, types[i])
+            adjoints[i] = as_argument(gradient, types[i])
         # The adjoint writes into the incoming gradients, which autograd may still hold, so it is given copies. It also
         # runs the forward pass again, whose results go to scratch memory.
         copies = [torch.clone(g, memory_format=torch.contiguous_format) for g in incoming]
         scratch = empty_outputs(arguments, torch.empty)
+        given = [*zip(arguments, types, strict=True), *zip(scratch, kinds, strict=True)]
+        adjoints += [as_argument(t, kind) for t, kind in zip(copies, kinds, strict=True)]
         with torch_stream(at.device) as warp_device:
-            wp.launch(
-                kernel,
-                dim=at.shape[0],
-                inputs=[as_warp(t, kind) for t, kind in zip(arguments, types, strict=True)],
-                outputs=[as_warp(t, kind) for t, kind in zip(scratch, kinds, strict=True)],
-                adj_inputs=adjoints,
-                adj_outputs=[as_warp(t, kind) for t, kind in zip(copies, kinds, strict=True)],
-                adjoint=True,
-                device=warp_device,
-            )
+            launch_adjoint(kernel, at.shape[0], [as_argument(t, kind) for t, kind in given], adjoints, warp_device)
         return unpacked(results)
 
     def fake_backward(*tensors: torch.Tensor) -> Any:
@@ -147,6 +140,24 @@ def row_operator(
 
     operator.register_autograd(pull_back, setup_context=save)
     return operator
+
+
+class Packed(list[torch.Tensor]):
+    """Constants of a solver as the one list of tensors that an operator takes, with what was made of it."""
+
+    def __init__(self, tensors: Sequence[torch.Tensor]) -> None:
+        super().__init__(tensors)
+        self.made: dict[object, Any] = {}
+
+
+def made_of(model: list[torch.Tensor], make: Callable[[list[torch.Tensor]], _Model]) -> _Model:
+    """The result of a function of constants; called once for a list that is `Packed`."""
+    if not isinstance(model, Packed):
+        return make(model)
+    if make not in model.made:
+        model.made[make] = make(model)
+    result: _Model = model.made[make]
+    return result
 
 
 def pack(model: tuple[Any, ...]) -> list[torch.Tensor]:

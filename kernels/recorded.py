@@ -6,6 +6,7 @@ same types and call the same function:
 
     recorded launch of a kernel  ->  compiled function, types of its arguments, type of its bounds
     launch(kernel, rows, arguments)  ->  function(bounds(rows), structure(arguments))
+    adjoint(kernel, rows, arguments, adjoints)  ->  function(bounds(rows), structure(arguments), structure(adjoints))
 
 Arguments that do not fit the structure are given to `wp.launch`, which says what is wrong with them. Nothing is
 recorded on a `wp.Tape`: kernels are differentiated by operators of torch.
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -33,13 +35,23 @@ class Record:
         rows: Number of threads of its first launch.
         arguments: Arguments of its first launch.
         device: The CPU.
+        adjoints: Adjoints of its arguments, if what is launched is its adjoint.
     """
 
-    def __init__(self, kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> None:
-        self.kept = wp.launch(kernel, dim=rows, inputs=arguments, device=device, record_cmd=True)  # and its module
-        self.forward = self.kept.hooks.forward
-        kinds = [type(value) for value in self.kept.params[1:]]
+    def __init__(
+        self,
+        kernel: wp.Kernel,
+        rows: int,
+        arguments: Sequence[object],
+        device: wp.Device,
+        adjoints: Sequence[object] | None = None,
+    ) -> None:
+        more: dict[str, Any] = {} if adjoints is None else {"adj_inputs": adjoints, "adjoint": True}
+        self.kept = wp.launch(kernel, dim=rows, inputs=arguments, device=device, record_cmd=True, **more)
+        self.function = self.kept.hooks.forward if adjoints is None else self.kept.hooks.backward
+        kinds = [type(value) for value in self.kept.params[1 : 1 + len(arguments)]]
         fields = [(f"argument_{k}", kind) for k, kind in enumerate(kinds)]
+        self.kinds = kinds
         self.structure: Any = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
         self.count, self.kind = len(fields), type(self.kept.bounds)
         self.ones = (1,) * (len(self.kept.bounds.shape) - 1)
@@ -60,8 +72,15 @@ class Record:
             raise TypeError("another number of arguments")
         return self.structure(*[_plain(value) for value in arguments])
 
+    def adjoints(self, values: Sequence[object]) -> Any:
+        """The same of adjoints, of which those of constants are None."""
+        values = [kind() if value is None else value for kind, value in zip(self.kinds, values, strict=True)]
+        return self.filled(values)
+
 
 _records: dict[wp.Kernel, Record] = {}
+_adjoints: dict[wp.Kernel, Record] = {}
+_recording = threading.Lock()  # Warp compiles and loads a module in one thread
 
 
 def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> None:
@@ -82,13 +101,14 @@ def prepared(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: 
     record = _records.get(kernel)
     try:
         if record is None:
-            record = Record(kernel, rows, arguments, device)
-            _records[kernel] = record
+            with _recording:
+                record = _records.get(kernel) or Record(kernel, rows, arguments, device)
+                _records[kernel] = record
         bounds, filled = record.bounds(rows), record.filled(arguments)
     except TypeError:
         wp.launch(kernel, dim=rows, inputs=arguments, device=device)  # says which argument is wrong
         return lambda: None
-    forward = record.forward
+    forward = record.function
     return lambda: forward(ctypes.byref(bounds), ctypes.byref(filled))
 
 
@@ -113,9 +133,27 @@ def divided(kernel: wp.Kernel, begins: Sequence[int], arguments: Sequence[object
 
 def _later(record: Record, like: Any, begin: int, end: int) -> Launch:
     """The call for one range: the structure of another one with its own first row."""
-    filled, bounds, forward = record.structure.from_buffer_copy(like), record.bounds(end - begin), record.forward
+    filled, bounds, forward = record.structure.from_buffer_copy(like), record.bounds(end - begin), record.function
     filled.argument_0 = begin
     return lambda: forward(ctypes.byref(bounds), ctypes.byref(filled))
+
+
+def adjoint(
+    kernel: wp.Kernel, rows: int, arguments: Sequence[object], adjoints: Sequence[object], device: wp.Device
+) -> None:
+    """Runs the adjoint of a kernel on a CPU.
+
+    Args:
+        kernel, rows, arguments, device: As of `launch`; results are written again.
+        adjoints: The adjoint of each argument, to which those of inputs are added; None for one that is a constant.
+    """
+    record = _adjoints.get(kernel)
+    if record is None:
+        with _recording:
+            record = _adjoints.get(kernel) or Record(kernel, rows, arguments, device, adjoints)
+            _adjoints[kernel] = record
+    bounds, filled, added = record.bounds(rows), record.filled(arguments), record.adjoints(adjoints)
+    record.function(ctypes.byref(bounds), ctypes.byref(filled), ctypes.byref(added))
 
 
 def _plain(value: Any) -> Any:

@@ -20,10 +20,13 @@ class Operator:
         name: Name with its namespace, "warpgarment::name".
         function: What it does on any device. It changes no argument.
         schema: Types of its arguments and results; None for those of the annotations.
+
+    Attributes:
+        function: The same function, which is called without torch's dispatcher, and so without gradients.
     """
 
     def __init__(self, name: str, function: Callable[..., Any], schema: str | None = None) -> None:
-        self.name, self.__doc__ = name, function.__doc__
+        self.name, self.function, self.__doc__ = name, function, function.__doc__
         torch.library.define(name, schema or torch.library.infer_schema(function, mutates_args=()))
         torch.library.impl(name, "default", function)
         namespace, local = name.split("::")

@@ -28,7 +28,7 @@ _starting = threading.Lock()
 
 
 def count() -> int:
-    """Number of threads that share the work of this one: 1 within a thread of the pool."""
+    """Number of threads that share the work of this one: 1 within a call that is spread."""
     number: int = getattr(_local, "count", 0) or torch.get_num_threads()
     return number
 
@@ -91,6 +91,14 @@ def spread(calls: Sequence[Call]) -> None:
             except BaseException as error:
                 failed.append(error)
 
+    def worked() -> None:
+        before = getattr(_local, "count", 0)
+        _local.count = 1  # what a call spreads itself would wait for the other calls
+        try:
+            work()
+        finally:
+            _local.count = before
+
     def helped() -> None:
         try:
             with torch.inference_mode(inference), torch.set_grad_enabled(grad):
@@ -101,7 +109,7 @@ def spread(calls: Sequence[Call]) -> None:
     _start(helpers)
     for _ in range(helpers):
         _tasks.put(helped)
-    work()
+    worked()
     for _ in range(helpers):
         done.acquire()
     if failed:

@@ -30,7 +30,7 @@ from trimesh.triangles import closest_point, points_to_barycentric
 
 from warpgarment.errors import MeshError
 from warpgarment.kernels.deformation.gradients import deformation_gradient
-from warpgarment.kernels.deformation.svd import rotation
+from warpgarment.kernels.deformation.replaced import rotation
 from warpgarment.kernels.mesh.laplacian import components
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment

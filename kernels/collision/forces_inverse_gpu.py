@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import as_argument, torch_stream
+from warpgarment.kernels.launch import as_argument, launch, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.system import System, block_dim, block_sum
 from warpgarment.kernels.operator import allocate
@@ -171,6 +171,7 @@ def displacement(
 
 @wp.kernel(enable_backward=False)
 def response(
+    by_rows: wp.int32,
     # Model:
     start: wp.array[wp.int32],
     rows: wp.array[wp.int32],
@@ -193,7 +194,12 @@ def response(
         pitch = wp.int64((start[component + 1] - start[component] + 15) / 16) * wp.int64(16)
         for m in range(start[component], start[component + 1]):
             j = rows[m]
-            z = compliance[base[component] + wp.int64(local[j]) * pitch + wp.int64(local[i])]
+            along = wp.int64(local[i])
+            down = wp.int64(local[j])
+            if by_rows != 0:  # Z is symmetric: a CPU reads a row, the threads of a GPU read next to each other
+                along = wp.int64(local[j])
+                down = wp.int64(local[i])
+            z = compliance[base[component] + down * pitch + along]
             h += wp.float64(z) * wp.dot(n, load[j])
     gap[i] = h
 
@@ -295,10 +301,11 @@ def respond(
     """n·(Z g) at the contacts, float64 [V], for a load g, float64 [V,3]; zero elsewhere."""
     gap = allocate((len(normal),), torch.float64, normal.device)
     with torch_stream(normal.device) as device:
-        wp.launch(
+        launch(
             response,
-            dim=len(normal),
-            inputs=[
+            len(normal),
+            [
+                int(device.is_cpu),
                 as_argument(system.start, wp.int32),
                 as_argument(system.rows, wp.int32),
                 as_argument(vertex_component, wp.int32),
@@ -309,6 +316,6 @@ def respond(
                 as_argument(load, wp.vec3d),
                 as_argument(gap, wp.float64),
             ],
-            device=device,
+            device,
         )
     return gap

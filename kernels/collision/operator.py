@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.launch import as_argument, launch, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System
-from warpgarment.kernels.operator import allocate, unpack
+from warpgarment.kernels.operator import allocate, made_of, unpack
 from warpgarment.kernels.registered import operator
 
 from . import forces_factor_cpu, forces_inverse_cpu, forces_inverse_gpu
@@ -101,16 +102,20 @@ def _solve(
     return increment, force, report, error
 
 
-def minimised(
+@operator("warpgarment::collision_solve")
+def collision_solve(
     vertices: torch.Tensor,
     normal: torch.Tensor,
     anchor: torch.Tensor,
     distance: torch.Tensor,
     tolerance: torch.Tensor,
-    model: Model,
+    model: list[torch.Tensor],
     max_iterations: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The operator `collision_solve` as a function, without gradients, and without what a call of an operator costs."""
+    """The minimiser of eq. 5 for given contacts: positions [m], and iterations and error [m] of each component.
+
+    `distance` is float64, of each contact or one for all.
+    """
     vertices, normal, anchor = vertices.contiguous(), normal.contiguous(), anchor.contiguous()
     gap = allocate((len(vertices),), torch.float64, vertices.device)
     with torch_stream(vertices.device) as device:
@@ -126,25 +131,8 @@ def minimised(
             ],
             device,
         )
-    increment, _, report, error = _solve(model, normal, gap, tolerance, 0.0, max_iterations)
+    increment, _, report, error = _solve(made_of(model, _unpacked), normal, gap, tolerance, 0.0, max_iterations)
     return (vertices.double() + increment).to(torch.float32), report, error
-
-
-@operator("warpgarment::collision_solve")
-def collision_solve(
-    vertices: torch.Tensor,
-    normal: torch.Tensor,
-    anchor: torch.Tensor,
-    distance: torch.Tensor,
-    tolerance: torch.Tensor,
-    model: list[torch.Tensor],
-    max_iterations: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The minimiser of eq. 5 for given contacts: positions [m], and iterations and error [m] of each component.
-
-    `distance` is float64, of each contact or one for all.
-    """
-    return minimised(vertices, normal, anchor, distance, tolerance, unpack(model, Model), max_iterations)
 
 
 @collision_solve.register_fake
@@ -171,7 +159,7 @@ def collision_solve_backward(
 ) -> torch.Tensor:
     """g - n (n·λ) with A λ = g; n·λ is the force of the contacts for the gap n·(B⁻¹ g)."""
     normal, g = normal.contiguous(), grad.double().contiguous()
-    parts = unpack(model, Model)
+    parts = made_of(model, _unpacked)
     system, dense, factor, _, vertex_component, _ = parts
     gap = torch.zeros(len(g), dtype=torch.float64, device=g.device)
     if dense.inverted:
@@ -190,6 +178,44 @@ def _(
     grad: torch.Tensor, normal: torch.Tensor, tolerance: torch.Tensor, model: list[torch.Tensor], max_iterations: int
 ) -> torch.Tensor:
     return torch.empty_like(grad, memory_format=torch.contiguous_format)
+
+
+def solved(
+    vertices: torch.Tensor,
+    normal: torch.Tensor,
+    anchor: torch.Tensor,
+    distance: torch.Tensor,
+    tolerance: torch.Tensor,
+    model: list[torch.Tensor],
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`collision_solve` past torch's dispatcher, which takes a millisecond for the list of a solver."""
+    given = vertices, normal, anchor, distance, tolerance, model, max_iterations
+    if torch.compiler.is_compiling():
+        return collision_solve(*given)
+    if torch.is_grad_enabled() and vertices.requires_grad:
+        result: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Solve.apply(*given)
+        return result
+    return collision_solve.function(*given)
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *given: Any) -> tuple[torch.Tensor, ...]:
+        _, ctx.normal, _, _, ctx.tolerance, ctx.model, ctx.max_iterations = given
+        output: tuple[torch.Tensor, ...] = collision_solve.function(*given)
+        ctx.mark_non_differentiable(*output[1:])
+        return output
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor, *_: None) -> tuple[Any, ...]:
+        given = ctx.normal, ctx.tolerance, ctx.model, ctx.max_iterations
+        return collision_solve_backward.function(gradient, *given), None, None, None, None, None, None
+
+
+def _unpacked(model: list[torch.Tensor]) -> Model:
+    return unpack(model, Model)
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:

@@ -39,7 +39,7 @@ from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.progress import Progress
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.mesh.laplacian import as_numpy, components, cotangent_laplacian
-from warpgarment.kernels.operator import pack
+from warpgarment.kernels.operator import Packed, pack
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 
 from . import compliance, compliance_rows
@@ -47,7 +47,7 @@ from .body_contacts import BodyContacts
 from .compliance import Compliance
 from .compliance_rows import Rows
 from .contact_set import ContactFrame, Contacts, one_for_each_vertex
-from .operator import Model, minimised
+from .operator import Model, solved
 
 TOLERANCE = 2e-6
 """Error of a solve in the energy norm [m].
@@ -112,8 +112,7 @@ class CollisionSolver:
         factors = Factor.build(base.tocsr(), system, explicit=False, budget=budget, skip=dense.base.cpu().numpy() >= 0)
         rows = Rows.build(system, factors, row_budget)
         owner = torch.from_numpy(vertex_component).to(device)
-        self._parts = Model(system, dense, factors, rows, owner, one_core)
-        self._model = pack(self._parts)
+        self._model = Packed(pack(Model(system, dense, factors, rows, owner, one_core)))
         self._limits: dict[float, torch.Tensor] = {}
         self._progress = Progress("CollisionSolver")
         self._normal: torch.Tensor | None = None  # of the contacts of the last refinement
@@ -243,11 +242,7 @@ class CollisionSolver:
         given = normal, anchor, distance.double(), limit
         if first:
             self._normal = normal
-        if torch.compiler.is_compiling() or (vertices.requires_grad and torch.is_grad_enabled()):
-            solved = torch.ops.warpgarment.collision_solve(vertices, *given, self._model, self.max_iterations)
-        else:
-            solved = minimised(vertices, *given, self._parts, self.max_iterations)
-        vertices, report, error = solved
+        vertices, report, error = solved(vertices, *given, self._model, self.max_iterations)
         self._progress.record(report, error, self.max_iterations, add=not first)
         return vertices
 

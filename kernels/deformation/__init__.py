@@ -10,7 +10,8 @@ from .gradients import (
     relative_deformation_gradient,
     segment_mean,
 )
-from .svd import replace_singular_values, rotation, singular_values
+from .replaced import replace_singular_values, rotation
+from .svd import singular_values
 
 __all__ = [
     "deformation_gradient",

@@ -1,4 +1,4 @@
-"""Singular values of deformation gradients: reading them, replacing them, removing them.
+"""Singular values of deformation gradients, and the rotations beside them.
 
 Manifold-aware transformers, section 4.3.1 and Algorithm 1 ("replace singular values of Φ with Σ"). The network
 predicts the singular values of a face's deformation gradient apart from the gradient itself, because they measure how
@@ -11,15 +11,6 @@ much cloth stretches; here they are put back:
     | Φ     | phi             | deformation gradient of a face, 3x3                                    |
     | Σ     | singular_values | its singular values, descending, never negative                        |
     | σ     | sigma           | Σ with the sign of det Φ on the smallest, since U and V are proper     |
-
-Gradients. With P = Uᵀ dΦ V and T = Uᵀ dR V, the rotations of U and V follow from the off-diagonal of P, and for i < j
-
-    T_ij + T_ji = (s_i − s_j)/(σ_i − σ_j) (P_ij + P_ji)
-    T_ij − T_ji = (s_i + s_j)/(σ_i + σ_j) (P_ij − P_ji)
-    T_ii = ds_i
-
-R jumps where σ_i = σ_j but s_i != s_j, so the first quotient has no limit there (an undeformed face is such a case).
-Both quotients are limited to `MAX_GAIN`: gradients are exact wherever R amplifies less than that, and always bounded.
 
 The decomposition runs in float64 (Warp's float32 one is off by 2e-4 on garments), by one-sided Jacobi rotations
 (Hestenes 1958): pairs of columns of A = Φ V are rotated until they are orthogonal; then σ are their lengths and U their
@@ -40,13 +31,10 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
-from warpgarment.kernels.operator import allocate, row_operator
+from warpgarment.kernels.launch import expect
+from warpgarment.kernels.operator import row_operator
 
 wp.set_module_options(compiling.options())
-
-MAX_GAIN = wp.constant(wp.float64(100.0))
-"""Largest factor by which the gradient of replace_singular_values may amplify one mode of its argument."""
 
 
 # Cosine between two columns, squared, below which they count as orthogonal
@@ -206,16 +194,6 @@ def adj_frame_singular_values(q: wp.mat33, inverse_rest: wp.mat33, adj_ret: wp.v
     wp.adjoint[inverse_rest] += wp.transpose(q) * adj_phi
 
 
-@wp.func
-def bounded_quotient(numerator: wp.float64, denominator: wp.float64):
-    """numerator / denominator for denominator >= 0, limited to ±MAX_GAIN; 0 / 0 is 0."""
-    if numerator == wp.float64(0.0):
-        return wp.float64(0.0)
-    if wp.abs(numerator) >= MAX_GAIN * denominator:
-        return MAX_GAIN * wp.sign(numerator)
-    return numerator / denominator
-
-
 @wp.kernel(enable_backward=False)
 def singular_values_kernel(
     # In:
@@ -245,59 +223,6 @@ def singular_values_gradient_kernel(
     grad_phi[i] = wp.mat33(u * wp.diag(g) * wp.transpose(v))
 
 
-@wp.kernel(enable_backward=False)
-def replace_singular_values_kernel(
-    # In:
-    phi: wp.array[wp.mat33],
-    values: wp.array[wp.vec3],
-    # Out:
-    replaced: wp.array[wp.mat33],
-):
-    """U diag(|values|) Vᵀ with proper rotations U and V of phi."""
-    i = wp.tid()
-    u, _sigma, v = svd(wp.mat33d(phi[i]))
-    s = wp.vec3d(values[i])
-    replaced[i] = wp.mat33(u * wp.diag(wp.vec3d(wp.abs(s[0]), wp.abs(s[1]), wp.abs(s[2]))) * wp.transpose(v))
-
-
-@wp.kernel(enable_backward=False)
-def replace_singular_values_gradient_kernel(
-    # In:
-    phi: wp.array[wp.mat33],
-    values: wp.array[wp.vec3],
-    grad_replaced: wp.array[wp.mat33],
-    # Out:
-    grad_phi: wp.array[wp.mat33],
-    grad_values: wp.array[wp.vec3],
-):
-    """The map from P to T in the module's docstring is its own transpose, so the gradient uses it unchanged."""
-    n = wp.tid()
-    u, sigma, v = svd(wp.mat33d(phi[n]))
-    g = wp.transpose(u) * wp.mat33d(grad_replaced[n]) * v
-    s = wp.vec3d(values[n])
-    m = wp.mat33d()
-    for i in range(3):
-        for j in range(i + 1, 3):
-            together = bounded_quotient(wp.abs(s[i]) - wp.abs(s[j]), sigma[i] - sigma[j]) * (g[i, j] + g[j, i])
-            against = bounded_quotient(wp.abs(s[i]) + wp.abs(s[j]), sigma[i] + sigma[j]) * (g[i, j] - g[j, i])
-            m[i, j] = wp.float64(0.5) * (together + against)
-            m[j, i] = wp.float64(0.5) * (together - against)
-    grad_phi[n] = wp.mat33(u * m * wp.transpose(v))
-    grad_values[n] = wp.vec3(wp.vec3d(wp.sign(s[0]) * g[0, 0], wp.sign(s[1]) * g[1, 1], wp.sign(s[2]) * g[2, 2]))
-
-
-@wp.kernel(enable_backward=False)
-def rotation_kernel(
-    from_row: wp.int32,
-    # In:
-    phi: wp.array[wp.mat33],
-    # Out:
-    turn: wp.array[wp.mat33],
-):
-    i = from_row + wp.tid()
-    turn[i] = wp.mat33(rotation_of(wp.mat33d(phi[i])))
-
-
 _singular_values = row_operator(
     "singular_values",
     singular_values_kernel,
@@ -306,15 +231,6 @@ _singular_values = row_operator(
     rows="phi",
     gradients=["phi"],
     backward=singular_values_gradient_kernel,
-)
-_replace_singular_values = row_operator(
-    "replace_singular_values",
-    replace_singular_values_kernel,
-    {"phi": wp.mat33, "values": wp.vec3},
-    {"replaced": (wp.mat33, (3, 3))},
-    rows="phi",
-    gradients=["phi", "values"],
-    backward=replace_singular_values_gradient_kernel,
 )
 
 
@@ -329,43 +245,3 @@ def singular_values(phi: torch.Tensor) -> torch.Tensor:
     """
     expect("phi", phi, (None, 3, 3))
     return _singular_values(phi)
-
-
-def replace_singular_values(phi: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
-    """Replaces the singular values of 3x3 matrices: U diag(|s|) Vᵀ for phi = U diag(σ) Vᵀ.
-
-    U and V are proper rotations, so the result has a positive determinant even where phi is inverted. A negative
-    value counts as its magnitude, since singular values have no sign.
-
-    Args:
-        phi: Deformation gradients, float32 [F, 3, 3].
-        s: New singular values, float32 [F, 3]; s[:, 0] replaces the largest one, and so on.
-
-    Returns:
-        float32 [F, 3, 3]. Differentiable in both arguments; where singular values of phi coincide, the gradient is
-        bounded (see `MAX_GAIN`).
-    """
-    expect("phi", phi, (None, 3, 3))
-    expect("s", s, (phi.shape[0], 3), device=phi.device)
-    return _replace_singular_values(phi, s)
-
-
-def rotation(phi: torch.Tensor) -> torch.Tensor:
-    """The proper rotations nearest to 3x3 matrices: U Vᵀ, the polar factor.
-
-    Args:
-        phi: Matrices, for example deformation gradients, float32 [F, 3, 3].
-
-    Returns:
-        Rotations with determinant +1, float32 [F, 3, 3]. Differentiable in phi.
-    """
-    expect("phi", phi, (None, 3, 3))
-    if phi.requires_grad and torch.is_grad_enabled():
-        return _replace_singular_values(phi, phi.new_ones(phi.shape[:2]))
-    phi = phi.detach()
-    turn = allocate(phi.shape, torch.float32, phi.device)
-    with torch_stream(phi.device) as device:
-        launch_rows(
-            rotation_kernel, len(phi), [as_argument(phi, wp.mat33)], [as_argument(turn, wp.mat33)], device, least=1024
-        )
-    return turn

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgarment.kernels.deformation.svd import rotation
+from warpgarment.kernels.deformation.replaced import rotation
 
 SPACING = 0.08
 """Distance of the points of a body [m]."""

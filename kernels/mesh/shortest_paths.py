@@ -78,7 +78,7 @@ class Paths:
         graph = graph[order][:, order]
         graph.data = np.minimum(np.rint(graph.data / self.unit), FAR).astype(np.int32)
         self._graph, self._edges = graph, _sent(graph)
-        self._targets = wp.array(self.place[targets], dtype=wp.int32, device="cpu")
+        self._targets: wp.array = wp.array(self.place[targets], dtype=wp.int32, device="cpu")
 
     def distances(self, sources: np.ndarray, limit: float = np.inf, threads: int | None = None) -> np.ndarray:
         """Lengths of the shortest paths from sources to the targets.
@@ -93,7 +93,7 @@ class Paths:
         """
         place, points = self.place[sources], self._landmarks[sources]
         lengths = np.empty((len(sources), len(self._targets)), np.float32)
-        found = wp.array(lengths, dtype=wp.float32, device="cpu", copy=False)
+        found: wp.array = wp.array(lengths, dtype=wp.float32, device="cpu", copy=False)
         whole = int(min(limit / self.unit, FAR - 1))
         near = _sent(_short_edges(self._graph)) if whole == FAR - 1 else self._edges  # a limit needs exact distances
         of_thread = threading.local()
@@ -106,7 +106,7 @@ class Paths:
             middle = np.argmin(((points[block] - points[block].mean(axis=0)) ** 2).sum(axis=1))
             block = np.roll(block, -middle)  # the order of nodes is that of the first source
             padded = np.concatenate([place[block], np.repeat(place[block[:1]], LANES - len(block))])
-            own = [wp.array(nodes, dtype=wp.int32, device="cpu") for nodes in (padded, block)]
+            own: list[wp.array] = [wp.array(nodes, dtype=wp.int32, device="cpu") for nodes in (padded, block)]
             inputs = [*self._edges, *near, self._targets, *own, whole, self.unit, *of_thread.work]
             wp.launch(search, dim=1, inputs=inputs, outputs=[found], device="cpu")
 

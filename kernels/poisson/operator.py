@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
-from warpgarment.kernels.launch import as_argument, launch_rows, launch_tiled, torch_stream
+from warpgarment.kernels.launch import as_argument, launch, launch_rows, launch_tiled, torch_stream
 from warpgarment.kernels.linear import conjugate_gradients, triangular
 from warpgarment.kernels.linear.factor import Factor
 from warpgarment.kernels.linear.system import System, block_dim
-from warpgarment.kernels.operator import allocate, unpack
+from warpgarment.kernels.operator import allocate, made_of, unpack
 from warpgarment.kernels.registered import operator
 
 from .kernels import phi_adjoint, place, place_adjoint, right_hand_side
@@ -46,33 +47,29 @@ class Matrix(NamedTuple):
     factor: Factor
 
 
-class Model(NamedTuple):
-    """The tensors of a solver, as functions and as kernels take them."""
+def _views(model: list[torch.Tensor]) -> dict[str, object]:
+    return made_of(model, _made_views)
 
-    tensors: dict[str, torch.Tensor]  # by the names of `MODEL`
-    views: dict[str, object]  # arguments of launches, which are valid as long as the tensors
-    start_rows: list[object]
-    matrix: Matrix
 
-    @classmethod
-    def of(cls, listed: list[torch.Tensor]) -> Model:
-        """From the list that the operators take."""
-        tensors, matrix = _named(listed), matrix_of(listed)
-        views = {name: as_argument(tensors[name], dtype) for name, dtype in MODEL if dtype is not None}
-        views["corner_faces"] = as_argument(tensors["faces"], wp.vec3i)
-        views["corner_cotangents"] = as_argument(tensors["half_cotangent"], wp.vec3d)
-        system = matrix.system
-        return cls(tensors, views, [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32)], matrix)
+def _made_views(model: list[torch.Tensor]) -> dict[str, object]:
+    tensors = _named(model)
+    return {name: as_argument(tensors[name], dtype) for name, dtype in MODEL if dtype is not None}
+
+
+def _start_rows(model: list[torch.Tensor]) -> list[object]:
+    system = matrix_of(model).system
+    return [as_argument(system.start, wp.int32), as_argument(system.rows, wp.int32)]
 
 
 def _solve(
-    model: Model, rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
+    model: list[torch.Tensor], rhs: torch.Tensor, tolerance: torch.Tensor, relative: float, max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Solves (L + W) D = g: directly where there is a factor, otherwise by conjugate gradients.
 
     Returns as `conjugate_gradients.solve` does: D [m], float64 [V,3], iterations and error of each component.
     """
-    (system, factor), tensors = model.matrix, model.tensors
+    system, factor = matrix_of(model)
+    tensors = _named(model)
     if factor.unfactored:
         load = factor.without(rhs, tensors["vertex_component"])
         solution, report, error = conjugate_gradients.solve(
@@ -91,67 +88,11 @@ def _named(model: list[torch.Tensor]) -> dict[str, torch.Tensor]:
 
 def matrix_of(model: list[torch.Tensor]) -> Matrix:
     """The matrix, taken from the tensors of a solver."""
+    return made_of(model, _made_matrix)
+
+
+def _made_matrix(model: list[torch.Tensor]) -> Matrix:
     return unpack(model[len(MODEL) :], Matrix)
-
-
-def solved(
-    phi: torch.Tensor,
-    mean: torch.Tensor,
-    pin_target: torch.Tensor,
-    initial: torch.Tensor,
-    model: Model,
-    max_iterations: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The operator `poisson_solve` as a function, without gradients, and without what a call of an operator costs."""
-    tensors, m, count = model.tensors, model.views, len(mean)
-    phi, mean, pin_target = phi.contiguous(), mean.contiguous(), pin_target.contiguous()
-    guess = initial.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
-    if len(pin_target):  # a pinned component starts with the mean translation of its pins
-        pins = tensors["pins"]
-        offset = torch.zeros((count, 3), dtype=torch.float64, device=phi.device)
-        offset.index_add_(0, tensors["vertex_component"][pins], pin_target.double() - guess[pins])
-        guess += (offset / tensors["pins_in_component"].clamp(min=1.0))[tensors["vertex_component"]]
-    rhs = allocate(guess.shape, torch.float64, phi.device)
-    vertices = allocate(guess.shape, torch.float32, phi.device)
-    if count == 0:
-        return vertices, vertices.new_empty(0, dtype=torch.int32), vertices.new_empty(0, dtype=torch.float64)
-    with torch_stream(phi.device) as device:
-        launch_rows(
-            right_hand_side,
-            len(guess),
-            inputs=[
-                m["corner_faces"],
-                m["corner_cotangents"],
-                m["corner_start"],
-                m["corners"],
-                m["corner_edge"],
-                m["pin_of_vertex"],
-                m["pin_stiffness"],
-                as_argument(phi, wp.mat33),
-                as_argument(guess, wp.vec3d),
-                as_argument(pin_target, wp.vec3),
-                as_argument(rhs, wp.vec3d),
-            ],
-            outputs=[],
-            device=device,
-        )
-        increment, report, error = _solve(model, rhs, tensors["tolerance"], 0.0, max_iterations)
-        launch_tiled(
-            place,
-            count,
-            [
-                *model.start_rows,
-                m["kind"],
-                m["centroid_weight"],
-                as_argument(guess, wp.vec3d),
-                as_argument(increment, wp.vec3d),
-                as_argument(mean, wp.vec3),
-                as_argument(vertices, wp.vec3),
-            ],
-            device,
-            block_dim=block_dim(phi.device, len(guess), count),
-        )
-    return vertices, report, error
 
 
 @operator("warpgarment::poisson_solve")
@@ -176,7 +117,55 @@ def poisson_solve(
     Returns:
         Positions [m], float32 [V,3]; iterations, int32 [C]; estimated error in the energy norm [m], float64 [C].
     """
-    return solved(phi, mean, pin_target, initial, Model.of(model), max_iterations)
+    tensors, m, count = _named(model), _views(model), len(mean)
+    phi, mean, pin_target = phi.contiguous(), mean.contiguous(), pin_target.contiguous()
+    guess = initial.to(torch.float64, copy=True, memory_format=torch.contiguous_format)
+    if len(pin_target):  # a pinned component starts with the mean translation of its pins
+        pins = tensors["pins"]
+        offset = torch.zeros((count, 3), dtype=torch.float64, device=phi.device)
+        offset.index_add_(0, tensors["vertex_component"][pins], pin_target.double() - guess[pins])
+        guess += (offset / tensors["pins_in_component"].clamp(min=1.0))[tensors["vertex_component"]]
+    rhs = allocate(guess.shape, torch.float64, phi.device)
+    vertices = allocate(guess.shape, torch.float32, phi.device)
+    if count == 0:
+        return vertices, vertices.new_empty(0, dtype=torch.int32), vertices.new_empty(0, dtype=torch.float64)
+    with torch_stream(phi.device) as device:
+        launch_rows(
+            right_hand_side,
+            len(guess),
+            inputs=[
+                as_argument(tensors["faces"], wp.vec3i),
+                as_argument(tensors["half_cotangent"], wp.vec3d),
+                m["corner_start"],
+                m["corners"],
+                m["corner_edge"],
+                m["pin_of_vertex"],
+                m["pin_stiffness"],
+                as_argument(phi, wp.mat33),
+                as_argument(guess, wp.vec3d),
+                as_argument(pin_target, wp.vec3),
+                as_argument(rhs, wp.vec3d),
+            ],
+            outputs=[],
+            device=device,
+        )
+        increment, report, error = _solve(model, rhs, tensors["tolerance"], 0.0, max_iterations)
+        launch_tiled(
+            place,
+            count,
+            [
+                *_start_rows(model),
+                m["kind"],
+                m["centroid_weight"],
+                as_argument(guess, wp.vec3d),
+                as_argument(increment, wp.vec3d),
+                as_argument(mean, wp.vec3),
+                as_argument(vertices, wp.vec3),
+            ],
+            device,
+            block_dim=block_dim(phi.device, len(guess), count),
+        )
+    return vertices, report, error
 
 
 @poisson_solve.register_fake
@@ -201,8 +190,7 @@ def poisson_solve_backward(
     grad_vertices: torch.Tensor, mean: torch.Tensor, model: list[torch.Tensor], max_iterations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Gradients with respect to phi, mean and pin_target: one solve with the same matrix."""
-    parts = Model.of(model)
-    tensors, m, count = parts.tensors, parts.views, len(mean)
+    tensors, m, count = _named(model), _views(model), len(mean)
     grad_vertices = grad_vertices.contiguous()
     rhs = allocate(grad_vertices.shape, torch.float64, mean.device)
     grad_mean = allocate(mean.shape, torch.float32, mean.device)
@@ -210,33 +198,33 @@ def poisson_solve_backward(
     if count == 0:
         return grad_phi, grad_mean, mean.new_empty((0, 3))
     with torch_stream(mean.device) as device:
-        wp.launch_tiled(
+        launch_tiled(
             place_adjoint,
-            dim=[count],
-            inputs=[
-                *parts.start_rows,
+            count,
+            [
+                *_start_rows(model),
                 m["kind"],
                 m["centroid_weight"],
                 as_argument(grad_vertices, wp.vec3),
                 as_argument(rhs, wp.vec3d),
                 as_argument(grad_mean, wp.vec3),
             ],
+            device,
             block_dim=block_dim(mean.device, len(rhs), count),
-            device=device,
         )
         exactly = torch.zeros_like(tensors["tolerance"])
-        adjoint, _, _ = _solve(parts, rhs, exactly, ADJOINT_TOLERANCE, max_iterations)
-        wp.launch(
+        adjoint, _, _ = _solve(model, rhs, exactly, ADJOINT_TOLERANCE, max_iterations)
+        launch(
             phi_adjoint,
-            dim=len(grad_phi),
-            inputs=[
+            len(grad_phi),
+            [
                 m["rest_vertices"],
                 m["faces"],
                 m["half_cotangent"],
                 as_argument(adjoint, wp.vec3d),
                 as_argument(grad_phi, wp.float32),
             ],
-            device=device,
+            device,
         )
     pins = tensors["pins"]
     grad_pins = (tensors["pin_stiffness"][pins, None] * adjoint[pins]).to(torch.float32)
@@ -253,6 +241,39 @@ def _(
         torch.empty_like(mean, memory_format=torch.contiguous_format),
         mean.new_empty((tensors["pins"].shape[0], 3)),
     )
+
+
+def solved(
+    phi: torch.Tensor,
+    mean: torch.Tensor,
+    pin_target: torch.Tensor,
+    initial: torch.Tensor,
+    model: list[torch.Tensor],
+    max_iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`poisson_solve` past torch's dispatcher, which takes a millisecond for the list of a solver."""
+    if torch.compiler.is_compiling():
+        return poisson_solve(phi, mean, pin_target, initial, model, max_iterations)
+    if torch.is_grad_enabled() and (phi.requires_grad or mean.requires_grad or pin_target.requires_grad):
+        result: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Solve.apply(
+            phi, mean, pin_target, initial, model, max_iterations
+        )
+        return result
+    return poisson_solve.function(phi, mean, pin_target, initial, model, max_iterations)
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *given: Any) -> tuple[torch.Tensor, ...]:
+        _, ctx.mean, _, _, ctx.model, ctx.max_iterations = given
+        output: tuple[torch.Tensor, ...] = poisson_solve.function(*given)
+        ctx.mark_non_differentiable(*output[1:])
+        return output
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor, *_: None) -> tuple[Any, ...]:
+        return *poisson_solve_backward.function(gradient, ctx.mean, ctx.model, ctx.max_iterations), None, None, None
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:

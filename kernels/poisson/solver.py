@@ -38,10 +38,10 @@ from warpgarment.kernels.linear import factor
 from warpgarment.kernels.linear.progress import Progress
 from warpgarment.kernels.linear.system import System
 from warpgarment.kernels.mesh.laplacian import as_numpy, components, cotangent_laplacian, half_cotangents
-from warpgarment.kernels.operator import pack
+from warpgarment.kernels.operator import Packed, pack
 
 from .kernels import FREE, ISOLATED, PINNED
-from .operator import MODEL, Matrix, Model, solved
+from .operator import MODEL, Matrix, solved
 
 TOLERANCE = 3e-7
 """Error of conjugate gradients in the energy norm as a share of the rest bounding box diagonal.
@@ -144,8 +144,7 @@ class PoissonSolver:
         explicit = device.type != "cpu" if explicit is None else explicit
         grounded = (matrix + scipy.sparse.diags(_ground(matrix, vertex_component, kind))).tocsr()
         factors = factor.Factor.build(grounded, system, explicit=explicit, budget=factor_budget)
-        self._model = [*(tensors[name] for name, _ in MODEL), *pack(Matrix(system, factors))]
-        self._parts = Model.of(self._model)
+        self._model = Packed([*(tensors[name] for name, _ in MODEL), *pack(Matrix(system, factors))])
         self._progress = Progress("PoissonSolver")
         self.rest_vertices, self.faces = tensors["rest_vertices"], tensors["faces"]
         self.pins = tensors["pins"]
@@ -211,13 +210,7 @@ class PoissonSolver:
                 raise ValueError(f"the solver has {len(self.pins)} pins; pass pin_targets [{len(self.pins)}, 3]")
             pin_targets = mean.new_empty((0, 3))
         expect("pin_targets", pin_targets, (len(self.pins), 3), device=device)
-        given = phi, mean, pin_targets, initial.detach()
-        differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
-        if differentiable or torch.compiler.is_compiling():
-            found = torch.ops.warpgarment.poisson_solve(*given, self._model, self.max_iterations)
-        else:
-            found = solved(*given, self._parts, self.max_iterations)
-        vertices, report, error = found
+        vertices, report, error = solved(phi, mean, pin_targets, initial.detach(), self._model, self.max_iterations)
         self._progress.record(report, error, self.max_iterations)
         return vertices
 

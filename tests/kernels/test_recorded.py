@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import recorded
-from warpgarment.kernels.launch import as_argument, as_warp, launch, launch_tiled
+from warpgarment.kernels.launch import as_argument, as_warp, launch, launch_adjoint, launch_tiled
 
 
 @wp.struct
@@ -89,6 +89,52 @@ def test_ranges_have_their_own_first_rows(known, monkeypatch):
     for call in reversed(calls):
         call()
     np.testing.assert_allclose(result.numpy(), expected, rtol=1e-5, atol=1e-5)
+
+
+@wp.kernel
+def scaled(factor: wp.array[wp.float32], points: wp.array[wp.vec3], power: wp.int32, result: wp.array[wp.float32]):
+    i = wp.tid()
+    value = factor[i]
+    if power == 2:
+        value *= factor[i]
+    result[i] = value * wp.length_sq(points[i])
+
+
+def test_adjoints_are_those_of_their_own_arguments():
+    """An adjoint would read arguments of the first launch, add to the wrong gradient, or not add. Float32: 1e-5."""
+    device, generator = wp.get_device("cpu"), torch.Generator().manual_seed(0)
+    for count, power in ((7, 1), (100, 2), (1, 1)):
+        factor, points = torch.rand(count, generator=generator), torch.rand(count, 3, generator=generator)
+        result, incoming = torch.full((count,), torch.nan), torch.rand(count, generator=generator)
+        before = torch.ones(count)
+        of_factor, passed = before.clone(), incoming.clone()
+        arguments = [as_argument(factor, wp.float32), as_argument(points, wp.vec3), power]
+        arguments.append(as_argument(result, wp.float32))
+        adjoints = [as_argument(of_factor, wp.float32), None, None, as_argument(passed, wp.float32)]
+        launch_adjoint(scaled, count, arguments, adjoints, device)
+        square = points.double().square().sum(1)
+        slope = incoming * square * (2.0 * factor if power == 2 else 1.0)
+        torch.testing.assert_close(of_factor.double(), before + slope.double(), rtol=1e-5, atol=1e-5)
+
+
+def test_kernels_are_recorded_once_by_several_threads():
+    """Two threads would compile and load a module at the same time."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def doubled(values: wp.array[wp.float32], result: wp.array[wp.float32]):
+        i = wp.tid()
+        result[i] = 2.0 * values[i]
+
+    device, values = wp.get_device("cpu"), torch.rand(50)
+    results = [torch.full((50,), torch.nan) for _ in range(8)]
+
+    def call(result: torch.Tensor) -> None:
+        launch(doubled, 50, [as_argument(values, wp.float32), as_argument(result, wp.float32)], device)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(call, results))
+    for result in results:
+        assert torch.equal(result, 2.0 * values)
 
 
 def test_a_block_of_a_row_is_one_lane():

@@ -43,12 +43,12 @@ def test_calls_run_on_several_threads_in_this_ones_mode(three):
 
     def call():
         met.wait()  # only passes if three calls run at the same time
-        seen.append((torch.is_inference_mode_enabled(), threads.count() if threading.current_thread() != me else 1))
+        seen.append((torch.is_inference_mode_enabled(), threads.count()))
 
-    me = threading.current_thread()
     with torch.inference_mode():
         threads.spread([call] * 3)
     assert seen == [(True, 1)] * 3
+    assert threads.count() == 3
 
 
 def test_an_exception_of_a_call_is_raised_after_all_have_ended(three):

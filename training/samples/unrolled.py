@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgarment.kernels.deformation.stretch import stretch
 from warpgarment.kernels.features.channels import INTERACTION
 from warpgarment.kernels.kept import Kept, keeping
 from warpgarment.nn.architecture import architecture
@@ -30,6 +31,7 @@ from .drawing import Past, displacement, part_of
 from .interactions import unpack
 from .noise import NoiseConfig
 from .recorded import SequenceData
+from .scenes import Scenes
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class UnrolledBatch:
     features: torch.Tensor  # [F,34] at frame t
     bodies: list[torch.Tensor]  # K+1 tensors [U,3], bodies at frames t..t+K
     recorded: list[torch.Tensor]  # K tensors [V,3], recorded positions at frames t+1..t+K
+    stretched: list[tuple[torch.Tensor, torch.Tensor]]  # their deformation gradients [F,3,3] and singular values [F,3]
     air: list[torch.Tensor]  # K tensors [B,3], velocity of the air at frames t+1..t+K [m/s]
     turn: torch.Tensor  # [B,3,3] rotation of the world for the network
     joint: torch.Tensor  # [B,3,3] the part of that rotation that the rest pose shares
@@ -94,7 +97,7 @@ class UnrolledBuilder:
         self.device = sequences[0].device
         self.subsets = architecture(network.config.architecture).subsets
         self.steps, self.collision_passes = steps, collision_passes
-        self._kept = Kept()
+        self._kept, self._scenes = Kept(), Scenes()
 
     def reaches(self, sequence: int, newest: int) -> bool:
         """Whether all K frames after `newest` are recorded."""
@@ -110,7 +113,8 @@ class UnrolledBuilder:
         part: slice = slice(None),
     ) -> UnrolledBatch:
         """Builds one batch, or a part of it, as `SampleBuilder.build`. But the batch has all faces, and the network
-        sees them in subsets of about `faces` faces (None: all at once)."""
+        sees them in subsets of about `faces` faces (None: all at once). A later batch may take over the scene of one
+        that is gone, of whose losses no gradients may be asked then."""
         total = sum(self.sequences[s].components for s, _ in picks) / len(picks)
         picks, streams, overrides = part_of(picks, rng, displacements, part)
         history, device = self.network.config.history, self.device
@@ -136,27 +140,21 @@ class UnrolledBuilder:
         placed = [
             torch.from_numpy(np.concatenate(parts)).to(device) for parts in zip(*(v for v, _ in bodies), strict=True)
         ]
-        with keeping(self._kept):
-            scene = Scene(
-                [data.garment for data in mine],
-                PackedBodies.pack([f for _, f in bodies], [v.shape[1] for v, _ in bodies], range(len(picks)), device),
-                placed[0],
-                torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)]),
-                self.network,
-                face_splits=face_splits,
-                epsilon=None,
-                collision_passes=self.collision_passes,
-                half=False,
-                timings=Timings(device),
-                materials=torch.stack([data.material for data in mine]),
-            )
+        first = torch.cat([data.vertices[max(t - history + 1, 0)] for (_, t), data in zip(picks, mine, strict=True)])
+        key = tuple(s for s, _ in picks), face_splits
+        scene = self._scenes.take(key)
+        if scene is None:
+            with keeping(self._kept):
+                scene = self._scene(mine, [f for _, f in bodies], placed[0], first, face_splits)
+        else:
+            scene.begin(placed[0], first)
         positions, interactions = torch.cat(past, dim=1), torch.cat(rows, dim=1)  # [H,V,3], [H,F,16]
         known = zip(positions, interactions, strict=True)
         features = torch.stack([scene.features.of_interaction(v.contiguous(), unpack(r)) for v, r in known], dim=1)
         means = torch.stack([scene.centroids(v) for v in positions], dim=1)  # [C,H,3]
         turn, joint, mirrored = self._symmetries(streams)
         counted = torch.tensor([data.recorded for data in mine], device=device)
-        return UnrolledBatch(
+        batch = UnrolledBatch(
             scene=scene,
             vertices=positions[-1].contiguous(),
             before=positions[-2].contiguous(),
@@ -164,6 +162,7 @@ class UnrolledBuilder:
             features=features[:, -1].contiguous(),
             bodies=placed[1:],
             recorded=recorded,
+            stretched=[stretch(scene.inverse_rest, frame, scene.packed.faces) for frame in recorded],
             air=[
                 torch.stack([data.air[t + k] for (_, t), data in zip(picks, mine, strict=True)])
                 for k in range(1, self.steps + 1)
@@ -177,6 +176,32 @@ class UnrolledBuilder:
             materials=torch.stack([data.material for data in mine]),
             counted=counted,
             ids=[(data.name, t) for (_, t), data in zip(picks, mine, strict=True)],
+        )
+        self._scenes.keep(key, scene, batch)
+        return batch
+
+    def _scene(
+        self,
+        mine: list[SequenceData],
+        body_faces: list[np.ndarray],
+        body: torch.Tensor,
+        first: torch.Tensor,
+        face_splits: int,
+    ) -> Scene:
+        """A new scene of sequences, with bodies [U,3] and garments [V,3] at the first known frame."""
+        counts = [int(faces.max()) + 1 for faces in body_faces]  # all vertices are those of faces
+        return Scene(
+            [data.garment for data in mine],
+            PackedBodies.pack(body_faces, counts, range(len(mine)), self.device),
+            body,
+            first,
+            self.network,
+            face_splits=face_splits,
+            epsilon=None,
+            collision_passes=self.collision_passes,
+            half=False,
+            timings=Timings(self.device),
+            materials=torch.stack([data.material for data in mine]),
         )
 
     def _symmetries(self, streams: list[np.random.Generator]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

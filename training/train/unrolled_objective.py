@@ -37,8 +37,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from warpgarment.kernels.deformation.gradients import deformation_gradient_from_inverse, relative_deformation_gradient
-from warpgarment.kernels.deformation.svd import singular_values
+from warpgarment.kernels.deformation.gradients import relative_deformation_gradient
 from warpgarment.kernels.features.channels import LAYOUT
 from warpgarment.kernels.features.outdoor import packed_columns
 from warpgarment.nn.network import GarmentNetwork
@@ -178,7 +177,7 @@ class UnrolledObjective(nn.Module):
             stacked = history.stacked(features.detach())
             live = [*live, features][-config.history :] if features.requires_grad else live
             newest = context(features, scene.packed.face_component, scene.packed.component_count)
-            target = targets(self._wanted(batch, vertices, features, recorded), newest, residual=config.residual)
+            target = targets(self._wanted(batch, vertices, features, k), newest, residual=config.residual)
             outside = packed_columns(
                 self.network.outdoor,
                 config.fps,
@@ -211,13 +210,13 @@ class UnrolledObjective(nn.Module):
                 features = scene.features(vertices, body, batch.bodies[k + 2])
 
     @staticmethod
-    def _wanted(batch: UnrolledBatch, vertices: torch.Tensor, features: torch.Tensor, recorded: torch.Tensor) -> Step:
-        """The step that leads from the state to the recorded frame."""
+    def _wanted(batch: UnrolledBatch, vertices: torch.Tensor, features: torch.Tensor, k: int) -> Step:
+        """The step that leads from the state to a recorded frame."""
         scene = batch.scene
         phi = features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3).contiguous()
-        phi_next = deformation_gradient_from_inverse(scene.inverse_rest, recorded, scene.packed.faces)
-        velocity = scene.centroids(recorded) - scene.centroids(vertices)
-        return Step(relative_deformation_gradient(phi_next, phi), singular_values(phi_next), velocity)
+        phi_next, values = batch.stretched[k]
+        velocity = scene.centroids(batch.recorded[k]) - scene.centroids(vertices)
+        return Step(relative_deformation_gradient(phi_next, phi), values, velocity)
 
     def _network(self, batch: UnrolledBatch, seen: Seen, target: NetworkOutput) -> tuple[NetworkOutput, torch.Tensor]:
         """Output of the network for packed inputs, and its losses [4] against a target."""

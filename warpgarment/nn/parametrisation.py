@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import torch
 
-from warpgarment.kernels.deformation.svd import rotation
+from warpgarment.kernels.deformation.replaced import rotation
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT
 
 
@@ -86,10 +86,10 @@ def context(
         face_mask: True where a face is real, shape [...,N]; None where all are.
 
     Returns:
-        The context; no gradient flows through its rotation.
+        The context, without gradients: the motion of the nearest body faces is a constant of features.
     """
-    newest = face_features[..., -FEATURES:]
-    deformation = newest[..., LAYOUT["body_deformation"]].detach()
+    newest = face_features[..., -FEATURES:].detach()
+    deformation = newest[..., LAYOUT["body_deformation"]]
     if face_mask is not None:  # a padded zero matrix has no rotation
         deformation = torch.where(face_mask[..., None], deformation, torch.eye(3, device=deformation.device).flatten())
     shape = deformation.shape[:-1]

@@ -171,6 +171,18 @@ class Scene:
             self.meet = Meet(packed, layers, first_vertices, self.contact, timings)
         self.correct = Correct(self.correctors, packed, self.contact.depth, timings)
 
+    def begin(self, body_vertices: torch.Tensor, first_vertices: torch.Tensor) -> None:
+        """Places the bodies anew, and ties pins to them; states and gradients of the scene so far are no longer usable.
+
+        Args:
+            body_vertices: Bodies in the first frame [m], packed, shape [U,3].
+            first_vertices: Garments in the first frame [m], packed, shape [V,3].
+        """
+        self.stacks = Stacks()
+        self.reconstruct.hold(first_vertices, self.bodies.at(body_vertices))
+        if self.skin is not None:
+            raise ValueError("a scene of a network that reads the skin begins once")
+
     def _refuse_far(self, vertices: torch.Tensor, body_of_vertex: torch.Tensor) -> None:
         """Raises MeshError for a garment whose vertices are all more than `FARTHEST` from its body."""
         assert self.bodies.placed is not None

@@ -254,7 +254,7 @@ def test_operator_passes_opcheck():
     query = bodies.query(vertices)
     normals, closest, *_ = collision.contacts(vertices, query.distance, query.face, bodies, EPSILON)
     limit, distance = (torch.full((1,), value, dtype=torch.float64) for value in (1e-6, EPSILON))
-    arguments = (vertices, normals, closest, distance, limit, solver_for(rest)._model, 100)
+    arguments = (vertices, normals, closest, distance, limit, list(solver_for(rest)._model), 100)
     torch.library.opcheck(torch.ops.warpgarment.collision_solve, arguments)
 
 

@@ -10,7 +10,7 @@ from support import meshes
 from support.poison import poison_outputs
 
 from warpgarment.kernels import deformation
-from warpgarment.kernels.deformation.svd import MAX_GAIN
+from warpgarment.kernels.deformation.replaced import MAX_GAIN
 
 GARMENTS = meshes.garments()
 

@@ -184,3 +184,23 @@ def test_face_means_agree_with_numpy(poisoned):
         FaceMeans(torch.tensor(mesh.faces), torch.tensor(segment), 3, len(vertices))
     with pytest.raises(ValueError, match="faces must lie within"):
         FaceMeans(torch.tensor(mesh.faces), torch.tensor(segment), 5, 7)
+
+
+def test_gradients_of_face_means_are_those_of_the_mean():
+    """Vertices would be pulled by another garment's mean, or as if each had one face. Against float64, 1e-6."""
+    mesh, count = meshes.icosphere(3), 2
+    faces = np.concatenate([mesh.faces, mesh.faces[5:] + len(mesh.vertices)])  # the second with vertices of no face
+    vertices = torch.tensor(np.concatenate([mesh.vertices, 2.0 * mesh.vertices]), dtype=torch.float32)
+    segment = torch.arange(2, dtype=torch.int32).repeat_interleave(torch.tensor([len(mesh.faces), len(mesh.faces) - 5]))
+    owner = torch.arange(2, dtype=torch.int32).repeat_interleave(len(mesh.vertices))
+    means = FaceMeans(torch.tensor(faces), segment, count, len(vertices), owner)
+    weight = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    moved = vertices.clone().requires_grad_()
+    found = means(moved)
+    assert torch.equal(found.detach(), means(vertices))
+    (found * weight).sum().backward()
+    twin = vertices.double().requires_grad_()
+    centroids = twin[torch.tensor(faces).long()].mean(1)
+    sums = torch.zeros(count, 3, dtype=torch.float64).index_add(0, segment.long(), centroids)
+    ((sums / torch.bincount(segment.long())[:, None]) * weight).sum().backward()
+    torch.testing.assert_close(moved.grad.double(), twin.grad, rtol=1e-6, atol=1e-9)

@@ -239,7 +239,7 @@ def test_operator_passes_opcheck():
     solver = solver_for(rest, pins=[1])
     arguments = (torch.tensor(phi).requires_grad_(), torch.tensor(mean).requires_grad_(), torch.ones(1, 3))
     initial = torch.tensor(rest.vertices)
-    torch.library.opcheck(torch.ops.warpgarment.poisson_solve, (*arguments, initial, solver._model, 100))
+    torch.library.opcheck(torch.ops.warpgarment.poisson_solve, (*arguments, initial, list(solver._model), 100))
 
 
 @pytest.mark.parametrize("way", SOLVERS)

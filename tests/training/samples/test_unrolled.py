@@ -10,12 +10,17 @@ from support import sequences as synthetic_sequences
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.data.sequence import Sequence
+from warpgarment.training.distributed import Group
 from warpgarment.training.samples import interactions
 from warpgarment.training.samples.augmentation import Augmentation
+from warpgarment.training.samples.loader import Loader, Plan
 from warpgarment.training.samples.noise import NoiseConfig
+from warpgarment.training.samples.pushforward import Pool
 from warpgarment.training.samples.recorded import SequenceData
+from warpgarment.training.samples.scenes import Scenes
 from warpgarment.training.samples.unrolled import UnrolledBuilder
 from warpgarment.training.train.losses import LossConfig
+from warpgarment.training.train.objective import Trainer
 from warpgarment.training.train.unrolled_objective import UnrollConfig, UnrolledObjective
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.0, geodesic_radius=0.2)
@@ -31,12 +36,18 @@ def loaded(tmp_path_factory) -> list[SequenceData]:
     return [SequenceData(Sequence.load(f), f, cache, SMALL, torch.device("cpu")) for f in sorted(root.glob("train_*"))]
 
 
-def test_a_builder_gives_the_same_batch_again(loaded):
-    """Set-up that was kept from an earlier batch is that of another garment or body: losses and gradients differ."""
+def network_of() -> ManifoldAwareTransformer:
+    """A network that does more than to move cloth as skin."""
     torch.manual_seed(0)
     network = ManifoldAwareTransformer(SMALL)
     for head in (network.face_head, network.velocity_head):
         torch.nn.init.normal_(head.weight, std=0.1)
+    return network
+
+
+def test_a_builder_gives_the_same_batch_again(loaded):
+    """Set-up that was kept from an earlier batch is that of another garment or body: losses and gradients differ."""
+    network = network_of()
     quiet, plain = NoiseConfig(position=0.0, offset=0.0), Augmentation(mirror=0.0, yaw=0.0)
     objective = UnrolledObjective(network, LossConfig(), 0.0, "float32", UnrollConfig(steps=2))
 
@@ -50,6 +61,53 @@ def test_a_builder_gives_the_same_batch_again(loaded):
         for one, other in zip(trained(builder, picks), trained(new, picks), strict=True):
             assert torch.equal(one, other)
     assert len(builder._kept) > len(new._kept) > 0, "there was something to keep"
+    assert len(builder._scenes) == 3, "a scene came again"
+
+
+def test_a_scene_is_not_taken_from_a_batch_that_lives(loaded):
+    """Two batches would share bodies and pins, so that the first one is changed by the second."""
+    network, store = network_of(), Scenes(most=2)
+    builder = UnrolledBuilder(loaded, network, NoiseConfig(), Augmentation(), 2, 1)
+    one = builder.build([(0, T)], None, np.random.default_rng(0))
+    other = builder.build([(0, 3)], None, np.random.default_rng(0))
+    assert one.scene is not other.scene
+    kept = one.scene
+    del one
+    assert builder.build([(0, 5)], None, np.random.default_rng(0)).scene is kept
+    for key in "abc":
+        store.keep(key, kept, np.zeros(1))
+    assert len(store) == 2
+    assert store.take("a") is None
+    assert store.take("c") is kept
+    assert store.take("c") is None
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_parts_in_threads_are_the_whole_batch(loaded, count):
+    """Garments that threads share would have other losses or gradients than in one call, or threads other bits. 1e-4:
+    sums of float32 in another order, over three steps."""
+    network = network_of()
+    builder = UnrolledBuilder(loaded, network, NoiseConfig(), Augmentation(), 3, 1)
+    plan = Plan([len(data.faces) for data in loaded], [np.array([3, 9]), np.array([5, 10])], 4, 0)
+    loader = Loader(builder, plan, Pool(), 0.0, lambda step: 1, 0, slice(None), 4)
+    objective = UnrolledObjective(network, LossConfig(), 0.0, "float32", UnrollConfig(steps=3, position=1.0))
+    trainer, before = Trainer(objective, Group("cpu"), False), torch.get_num_threads()
+    whole = objective(loader.build(0))
+    expected = [whole, *torch.autograd.grad(whole[0], list(network.parameters()), materialize_grads=True)]
+    found = []
+    torch.set_num_threads(count)
+    try:
+        for _ in range(3):  # the first in one thread
+            (batch,) = loader.batches(0, 1)
+            losses = trainer.backward(batch)
+            assert batch.work(network.config)[0] == 4
+            found.append([losses, *[parameter.grad.clone() for parameter in network.parameters()]])
+    finally:
+        torch.set_num_threads(before)
+    for one, other in zip(found[0], expected, strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-3, atol=1e-4 * float(other.detach().abs().max()))
+    for again in found[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(again, found[0], strict=True))
 
 
 def test_bodies_of_samples_are_those_of_the_sequence(loaded):

@@ -38,7 +38,7 @@ from torch import nn
 
 from warpgarment.errors import CheckpointError
 from warpgarment.io.disk.atomic import atomic_file
-from warpgarment.kernels.deformation.svd import rotation
+from warpgarment.kernels.deformation.replaced import rotation
 from warpgarment.kernels.features.skin import BOUND, Skin, bind
 from warpgarment.objects.body import BodyMotion
 from warpgarment.training.data.sequence import Sequence

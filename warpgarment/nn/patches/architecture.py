@@ -28,7 +28,6 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.rows import activation_bytes, row_groups
 from warpgarment.objects.garment import Garment
 
-from . import fused
 from .blocks import BLOCK
 from .layout import Patches, PatchLayout, garment_patches, patch_layout
 from .network import PatchTransformer
@@ -76,9 +75,10 @@ class PatchesOfCloth(Architecture):
             shared = len({id(garments[g]) for g, _, _ in group}) == 1
             layouts += length * PER_PATCHED_FACE * (1 if shared else len(group))
             widths = config.face_embedding, config.face_feed_forward
-            if sizes.cpu and not sizes.half:  # of all faces only what one layer hands to the next, and blocks by torch
+            if (
+                sizes.cpu and not sizes.half
+            ):  # of all faces what one layer hands to the next; a block, or packed weights
                 block = (stack + BLOCK_TOKENS * 4 * config.face_embedding) * min(length, BLOCK)
-                block *= not fused.planned(config)
                 network = max(network, len(group) * length * 4 * 3 * config.face_embedding + int(block))
                 continue
             network = max(network, activation_bytes(len(group) * length, stack, stacks, *widths, sizes.half))

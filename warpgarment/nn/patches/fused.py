@@ -72,14 +72,9 @@ def suits(network: PatchTransformer, count: int = 0) -> bool:
     """Whether this processor has vectors, and the widths are whole numbers of tiles; nothing is compiled."""
     config, fit = _fitting.get(network, (None, False))
     if config is not network.config:
-        config, fit = network.config, planned(network.config)
+        config, fit = network.config, products.present() and _widths_fit(network.config)
         _fitting[network] = config, fit
     return fit and count <= tokens.MOST_TOKENS
-
-
-def planned(config: NetworkConfig) -> bool:
-    """The same of a network that is not made yet."""
-    return products.present() and _widths_fit(config)
 
 
 def _widths_fit(config: NetworkConfig) -> bool:

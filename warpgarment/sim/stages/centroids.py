@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from warpgarment.kernels.deformation.face_means import FaceMeans
-from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
 from warpgarment.objects.pack import PackedGarments
 
 
@@ -17,12 +16,9 @@ class ComponentCentroids:
     """
 
     def __init__(self, packed: PackedGarments) -> None:
-        self._packed = packed
-        self._means = FaceMeans(packed.faces, packed.face_component, packed.component_count, len(packed.rest_vertices))
+        of = packed.face_component, packed.component_count, len(packed.rest_vertices), packed.vertex_component
+        self._means = FaceMeans(packed.faces, *of)
 
     def __call__(self, vertices: torch.Tensor) -> torch.Tensor:
-        """Positions [V,3] -> centroids [C,3], in metres; differentiable in positions that require a gradient."""
-        if vertices.requires_grad:
-            packed = self._packed
-            return segment_mean(face_centroids(vertices, packed.faces), packed.face_component, packed.component_count)
+        """Positions [V,3] -> centroids [C,3], in metres; differentiable."""
         return self._means(vertices)

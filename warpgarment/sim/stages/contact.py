@@ -164,7 +164,10 @@ class Contact:
             on_body = torch.where(pending[owner.long()], self._body_of_vertex, -1)
             found = self._contacts(vertices, ContactFrame(bodies, on_body, owner, self._epsilon, origin))
             missing = (found.normal * (found.anchor - vertices)).sum(1)
-            way = torch.where(missing > 0, missing + CLEAR, 0.0)
+            inside = missing > 0
+            if self.early_exit and not inside.any():
+                return vertices
+            way = torch.where(inside, missing + CLEAR, 0.0)
             vertices = (vertices + way[:, None] * found.normal).float()
         return vertices
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from warpgarment.kernels.deformation.face_means import FaceMeans
-from warpgarment.kernels.deformation.gradients import face_centroids, segment_mean
+from warpgarment.kernels.deformation.gradients import face_centroids
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT
 from warpgarment.kernels.features.face import BodyInteraction, body_interaction, face_features
 from warpgarment.kernels.features.frame import frame_features
@@ -42,7 +42,8 @@ class Features:
     ) -> None:
         self._packed, self._inverse_rest, self._body_of_face = packed, inverse_rest, body_of_face
         self._bodies, self._timings = bodies, timings
-        self._means = FaceMeans(packed.faces, packed.garment_of_face, packed.count, len(packed.rest_vertices))
+        of = packed.garment_of_face, packed.count, len(packed.rest_vertices), packed.garment_of_vertex
+        self._means = FaceMeans(packed.faces, *of)
 
     def __call__(self, vertices: torch.Tensor, body: torch.Tensor, next_body: torch.Tensor) -> torch.Tensor:
         """Features of frame t.
@@ -62,9 +63,9 @@ class Features:
         with self._timings("features"):
             bodies = self._bodies.at(body)
             if vertices.requires_grad:
-                centroids = face_centroids(vertices, packed.faces)
+                centroids = face_centroids(vertices.detach(), packed.faces)
                 interaction = body_interaction(centroids, self._body_of_face, bodies, next_body)
-                return self._from(vertices, centroids, interaction)
+                return self.of_interaction(vertices, interaction)
             return frame_features(
                 self._inverse_rest,
                 vertices,
@@ -86,11 +87,7 @@ class Features:
         Returns:
             Features, shape [F,34].
         """
-        return self._from(vertices, face_centroids(vertices, self._packed.faces), interaction)
-
-    def _from(self, vertices: torch.Tensor, centroids: torch.Tensor, interaction: BodyInteraction) -> torch.Tensor:
-        packed = self._packed
-        mean = segment_mean(centroids, packed.garment_of_face, packed.count)
+        packed, mean = self._packed, self._means(vertices)
         found = face_features(self._inverse_rest, vertices, packed.faces, packed.garment_of_face, mean, interaction)
         if not (self.sliding and found.requires_grad):
             return found

@@ -10,7 +10,7 @@ import torch
 
 from warpgarment.kernels import kept
 from warpgarment.kernels.deformation.next_frame import next_gradients
-from warpgarment.kernels.deformation.svd import replace_singular_values
+from warpgarment.kernels.deformation.replaced import replace_singular_values
 from warpgarment.kernels.features.channels import LAYOUT
 from warpgarment.kernels.poisson.solver import PoissonSolver
 from warpgarment.kernels.sdf.bodies import BodyMeshes
@@ -59,12 +59,17 @@ class Reconstruct:
         pinned = len(packed.pins) > 0
         self.solver = PoissonSolver(packed.rest_vertices, packed.faces, pins=packed.pins if pinned else None)
         self._pins: BodyPins | None = None
+        self._body_of_pin = body_of_garment[packed.garment_of_pin.long()]
+        self.hold(first_vertices, bodies)
         if pinned:
-            body_of_pin = body_of_garment[packed.garment_of_pin.long()]
-            self._pins = BodyPins(first_vertices[packed.pins.long()], bodies, body_of_pin)
             held = [(g.vertices, g.faces, g.pins, g.components[1]) for g in garments]
             responses = [kept.of("mean response", each, partial(mean_response, *each)) for each in held]
             self._mean_response = torch.from_numpy(np.concatenate(responses)).to(packed.faces.device)[:, None]
+
+    def hold(self, first_vertices: torch.Tensor, bodies: BodyMeshes) -> None:
+        """Ties the pins to bodies, with garments [V,3] and bodies in the first frame [m]."""
+        if len(self._packed.pins):
+            self._pins = BodyPins(first_vertices[self._packed.pins.long()], bodies, self._body_of_pin)
 
     def __call__(
         self, vertices: torch.Tensor, step: Step | VertexStep, features: torch.Tensor, next_body: torch.Tensor
