@@ -14,6 +14,7 @@ from support.scenes import outfit, skirt, tube, walk
 
 from benchmarks.frames import FrameCounts
 from warpgarment.errors import CheckpointError
+from warpgarment.kernels.dense.products import INTEGERS
 from warpgarment.kernels.features.channels import FACE, FEATURES, OUTDOOR
 from warpgarment.nn import checkpoint
 from warpgarment.nn.architecture import GrowthError, architecture, build_network
@@ -115,7 +116,9 @@ def test_added_channels_change_nothing_at_first(kind):
     with torch.no_grad():
         a, b = run(network, rows).output, run(more, rows._replace(outdoor=outside)).output
     assert (a.psi - torch.eye(3)).abs().max() > 1e-3
-    torch.testing.assert_close(b, a, rtol=1e-6, atol=1e-7)  # longer sums in the first layer, here in one product
+    # longer sums in the first layer, here in one product; of which integers in later ones may be rounded otherwise
+    rounded = kind == "patches" and INTEGERS
+    torch.testing.assert_close(b, a, rtol=1e-6, atol=2e-3 if rounded else 1e-7)
     assert architecture(kind).start_from(more, more.config, grow=False) is more
 
 

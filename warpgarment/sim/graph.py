@@ -21,6 +21,7 @@ import warp as wp
 
 from .advance import advance
 from .frame import Frame
+from .history import Stacks
 from .scene import Scene
 
 WARM_UP = 3  # frames
@@ -59,6 +60,7 @@ class GraphedFrames:
 
     def __init__(self, scene: Scene, record: Record = cuda_graph) -> None:
         self.scene, self.record = scene, record
+        scene.stacks = Stacks()  # histories of one tensor, which are copied
         self.seen = 0
         self.failed = False
         self._recorded: tuple[Frame, torch.Tensor, Frame, Callable[[], None]] | None = None
@@ -107,5 +109,5 @@ class GraphedFrames:
 
 
 def _tensors(frame: Frame) -> list[torch.Tensor]:
-    """The fields of a frame on a GPU, where histories are stacked: there are no `Frames`."""
+    """The fields of a frame; its history is one tensor."""
     return [field for field in frame if isinstance(field, torch.Tensor)]

@@ -102,22 +102,24 @@ def predict(
     shown = NetworkSizes(garments, face_splits, half, cpu, body_vertices)
     network = dict(architecture(config.architecture).memory(shown, config))
     blocks, scratch, inverted = _compliance(garments)
+    kind = architecture(config.architecture)
+    histories = copies(faces, config.history, separate=not kind.positions, apart=kind.apart) if cpu else GRAPHED
+    history = int(histories * 4 * config.history * FEATURES * faces)
+    later = history + network.get("packed weights", 0)  # what is not there yet while a scene is made
     passing = {
         "network": network.pop("network", 0),
         "collision forces": scratch,
-        "making weights": network.pop("making weights", 0),
-        "inverting compliance": INVERTING[cpu] * 8 * inverted,
+        "making weights": max(0, network.pop("making weights", 0) - later),
+        "inverting compliance": max(0, INVERTING[cpu] * 8 * inverted - later),
     }
     peak = max(passing, key=lambda name: passing[name])
-    kind = architecture(config.architecture)
-    histories = copies(faces, config.history, separate=not kind.positions, apart=kind.apart) if cpu else GRAPHED
     return Memory(
         {
             **network,
             "compliance of collisions": blocks,
             "rows of compliance": _rows(unique) if cpu else 0,
             "factors of the solvers": _factors(unique, cpu),
-            "history of features": int(histories * 4 * config.history * FEATURES * faces),
+            "history of features": history,
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
             "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * relaxes,
             "pairs of layers": _pairs([len(garments[i].faces) for outfit in layers for i in outfit]),

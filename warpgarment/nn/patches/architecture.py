@@ -28,6 +28,7 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.rows import activation_bytes, row_groups
 from warpgarment.objects.garment import Garment
 
+from . import fused
 from .blocks import BLOCK
 from .layout import Patches, PatchLayout, garment_patches, patch_layout
 from .network import PatchTransformer
@@ -69,20 +70,23 @@ class PatchesOfCloth(Architecture):
         """Bytes of the patches of all faces, and of a call of the network."""
         garments, stack = sizes.garments, 4 * (config.history * FEATURES + OUTDOOR.width)
         stacks = (STACKS[len(garments) > 1],) * 2
-        layouts, network = 0, 0
+        layouts, network, kernels = 0, 0, sizes.cpu and not sizes.half and fused.planned(config)
         for group in row_groups(garments, config, 1, cpu=sizes.cpu):
             length = max(count for _, _, count in group)
             shared = len({id(garments[g]) for g, _, _ in group}) == 1
             layouts += length * PER_PATCHED_FACE * (1 if shared else len(group))
             widths = config.face_embedding, config.face_feed_forward
-            if (
-                sizes.cpu and not sizes.half
-            ):  # of all faces what one layer hands to the next; a block, or packed weights
-                block = (stack + BLOCK_TOKENS * 4 * config.face_embedding) * min(length, BLOCK)
-                network = max(network, len(group) * length * 4 * 3 * config.face_embedding + int(block))
+            if sizes.cpu and not sizes.half:  # of all faces only what one layer hands to the next
+                faces, block = len(group) * length * 4 * 3 * config.face_embedding, 0.0
+                if kernels:  # the turned weights of the first layer
+                    faces += len(group) * 4 * config.face_embedding * config.inputs
+                else:
+                    block = (stack + BLOCK_TOKENS * 4 * config.face_embedding) * min(length, BLOCK)
+                network = max(network, faces + int(block))
                 continue
             network = max(network, activation_bytes(len(group) * length, stack, stacks, *widths, sizes.half))
-        return {"geodesic weights": layouts, "network": network}
+        packed = {"packed weights": fused.packed_bytes(config)} if kernels else {}
+        return {"geodesic weights": layouts, **packed, "network": network}
 
     def flops(self, config: NetworkConfig, faces: int, components: int, rows: PatchLayout) -> tuple[int, int]:
         """Operations as at the top of this file."""

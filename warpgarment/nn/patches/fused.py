@@ -72,9 +72,23 @@ def suits(network: PatchTransformer, count: int = 0) -> bool:
     """Whether this processor has vectors, and the widths are whole numbers of tiles; nothing is compiled."""
     config, fit = _fitting.get(network, (None, False))
     if config is not network.config:
-        config, fit = network.config, products.present() and _widths_fit(network.config)
+        config, fit = network.config, planned(network.config)
         _fitting[network] = config, fit
     return fit and count <= tokens.MOST_TOKENS
+
+
+def planned(config: NetworkConfig) -> bool:
+    """The same of a network that is not made yet."""
+    return products.present() and _widths_fit(config)
+
+
+def packed_bytes(config: NetworkConfig) -> int:
+    """Memory of the packed weights of a network."""
+    width, hidden, e, wide = config.face_embedding, config.face_feed_forward, config.embedding, config.feed_forward
+    columns = 3 * e - 2 * config.manifold_heads * (e // config.heads)
+    inner = width * hidden * (2 + 3 * config.face_layers) + config.layers * e * (columns + e + 2 * wide)
+    outer = width * (config.inputs + 3 * e + products.STEP)
+    return outer * 4 + inner * (2 if products.INTEGERS else 4)
 
 
 def _widths_fit(config: NetworkConfig) -> bool:
