@@ -203,16 +203,23 @@ def launch_tiled(
         recorded.launch(kernel, rows, arguments, device)
 
 
-@contextlib.contextmanager
-def torch_stream(device: torch.device) -> Iterator[wp.Device]:
+def torch_stream(device: torch.device) -> contextlib.AbstractContextManager[wp.Device]:
     """Context in which Warp launches run on torch's current stream of the device; yields the Warp device.
 
     Nothing is ever put on Warp's own stream, so the two streams need not be synchronised; a graph capture would refuse
     such a wait.
     """
-    if device.type != "cuda":
-        yield _cpu()
-        return
+    return _on_cpu() if device.type != "cuda" else _on_stream(device)
+
+
+@functools.cache
+def _on_cpu() -> contextlib.AbstractContextManager[wp.Device]:
+    """The same object for all launches on a CPU, which has no streams."""
+    return contextlib.nullcontext(_cpu())
+
+
+@contextlib.contextmanager
+def _on_stream(device: torch.device) -> Iterator[wp.Device]:
     wp.init()  # at first use and not at import, so that importing never touches a driver
     with wp.ScopedStream(wp.stream_from_torch(device), sync_enter=False):
         yield wp.device_from_torch(device)

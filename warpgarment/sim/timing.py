@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
 
 import torch
 
@@ -21,19 +20,26 @@ class Timings(dict[str, float]):
         self.device = device
         self.synchronise = False
 
-    @contextlib.contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Adds the time of the block to the stage."""
-        cuda = self.device.type == "cuda"
-        if cuda and not self.synchronise:
-            yield
-            return
-        if cuda:
-            torch.cuda.synchronize(self.device)
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            if cuda:
-                torch.cuda.synchronize(self.device)
-            self[stage] = self.get(stage, 0.0) + time.perf_counter() - start
+    def __call__(self, stage: str) -> contextlib.AbstractContextManager[None]:
+        """A block whose time is added to the stage."""
+        if self.device.type == "cuda" and not self.synchronise:
+            return contextlib.nullcontext()
+        return _Block(self, stage)
+
+
+class _Block:
+    def __init__(self, timings: Timings, stage: str) -> None:
+        self._timings, self._stage = timings, stage
+
+    def __enter__(self) -> None:
+        self._wait()
+        self._start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._wait()
+        spent = time.perf_counter() - self._start
+        self._timings[self._stage] = self._timings.get(self._stage, 0.0) + spent
+
+    def _wait(self) -> None:
+        if self._timings.device.type == "cuda":
+            torch.cuda.synchronize(self._timings.device)
