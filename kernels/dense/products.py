@@ -254,6 +254,11 @@ struct Inner {
             const float largest = __builtin_reduce_max(most) / 32767.0f;
             float u = __builtin_sqrtf(Vector::total(square)) / 46300.0f;
             u = largest > u ? largest : u;
+            if (!(u < 1.0e30f)) {  // a number that is not finite: so are the products
+                unit[i] = __builtin_nanf("");
+                __builtin_memset(all + (long)i * width, 0, 2l * width);
+                return;
+            }
             u = u > 1.0e-30f ? u : 1.0e-30f;
             unit[i] = u;
             const v16 over = Vector::all(1.0f / u), half = Vector::all(12582912.0f);

@@ -8,7 +8,7 @@ four of NEON. `Vector` has
 | `load`, `store`, `all`, `total`, `fma` | to and from memory, one number sixteen times, their sum, a b + c |
 | `norm` | rows with their mean subtracted, over their standard deviation; returns one over that |
 | `exp` | of numbers that are not positive, error 2e-7 of the result |
-| `gelu` | x Phi(x) = max(x, 0) - T(abs x), with T(a) = a Phi(-a) |
+| `gelu` | x Phi(x) = max(x, 0) - T(abs x), with T(a) = a Phi(-a); NaN of NaN |
 | `slope` | its derivative, 1 - T'(x) for x > 0 and T'(-x) elsewhere |
 
 With AVX-512, T is one of 32 polynomials on [0, 6), chosen by lane from two registers: errors 3e-8 and, of T', 1e-6.
@@ -102,7 +102,7 @@ struct Vector {
         p = fma(p, t, __builtin_ia32_vpermi2varps512(T2));
         p = fma(p, t, __builtin_ia32_vpermi2varps512(T1));
         p = fma(p, t, __builtin_ia32_vpermi2varps512(T0));
-        return __builtin_elementwise_max(x, all(0.0f)) - p;
+        return (x < 0.0f ? v16{} : x) - p;
     }
     static inline v16 slope(v16 x) {
         i16 piece;
@@ -130,7 +130,7 @@ struct Vector {
     }
     static inline v16 gelu(v16 x) {
         v16 a = __builtin_elementwise_abs(x);
-        return __builtin_elementwise_max(x, all(0.0f)) - a * tail(a);
+        return (x < 0.0f ? v16{} : x) - a * tail(a);
     }
     static inline v16 slope(v16 x) {
         v16 a = __builtin_elementwise_abs(x);

@@ -172,3 +172,20 @@ def test_a_row_of_zeros():
     zeros = torch.zeros(1, 1, WIDTH)
     faces.hear(zeros, torch.zeros(1, 1, WIDTH), None, layer, torch.full((1, 1, WIDTH), torch.nan))
     close(zeros, function(torch.zeros(1, 1, WIDTH, dtype=torch.float64)), OFF)
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+def test_numbers_that_are_not_finite_stay_visible(wrong):
+    """A garment that failed would look as if it had not, or make others of its block fail."""
+    layer, function = perceptron(2 * WIDTH)
+    own = normal(1, 3, WIDTH)
+    own[0, 1, 7] = wrong
+    sides = torch.tensor([[[0, 0, 2], [0, 2, 2], [2, 2, 2]]])
+    x = torch.zeros(1, 3, WIDTH)
+    faces.hear(x, own, sides, layer, torch.full((1, 3, WIDTH), torch.nan))
+    assert not x[0, 1].isfinite().any()
+    heard = torch.cat([own[0], own[0][sides[0]].mean(dim=1)], dim=1)[[0, 2]]
+    close(x[0, [0, 2]], function(heard.double()), OFF)
+    broken = layer._replace(contract=products.pack_inner(torch.full((WIDTH, HIDDEN), torch.nan)))
+    faces.hear(x, torch.ones(1, 3, WIDTH), sides, broken, torch.full((1, 3, WIDTH), torch.nan))
+    assert x.isnan().all()
