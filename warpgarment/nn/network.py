@@ -7,6 +7,7 @@ of Psi, Sigma and q is in parametrisation.py. Statistics are buffers, so checkpo
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -170,7 +171,7 @@ class GarmentNetwork(nn.Module):
             newest.new_empty((faces, 3, 3)), newest.new_empty((faces, 3)), newest.new_zeros((components, 3))
         )
         if newest.device.type == "cpu" and not (torch.is_grad_enabled() or bfloat16):
-            for view in layout.views:
+            for view in itertools.chain.from_iterable(view.one_by_one for view in layout.views):
                 self._step(view, view.inputs(features, velocities, outside), newest, output)
             body = component_mean(newest[:, LAYOUT["body_velocity"]], layout.face_component, components)
             velocity = output.velocity + body if self.config.residual else output.velocity

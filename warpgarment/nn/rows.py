@@ -47,6 +47,7 @@ class PaddedView:
     real_faces: torch.Tensor | None  # int64, indices of True entries of the flattened face_mask; None if it is None
     real_components: torch.Tensor | None  # int64, indices of True entries of the flattened component_mask
     begin: int | None  # first packed face, if the rows are faces that follow each other, without padding
+    shared: bool = False  # whether `weights` are of one row that serves several
 
     @cached_property
     def index(self) -> torch.Tensor:
@@ -57,6 +58,24 @@ class PaddedView:
     def piece(self) -> torch.Tensor:
         """Packed component of each entry, int64 [R,C]; -1 for padding."""
         return _or_none(self.component_index, self.component_mask)
+
+    @cached_property
+    def one_by_one(self) -> list[PaddedView]:
+        """Views of one row each, which gets the same bits as alone: some matrix libraries add up the rows of a product
+        in an order that depends on their number. Rows that are padded, or have weights of their own, stay together."""
+        rows, faces = self.face_index.shape
+        if not self.shared or faces <= SMALL or self.face_mask is not None or self.component_mask is not None:
+            return [self]
+        return [
+            dataclasses.replace(
+                self,
+                face_index=self.face_index[r : r + 1],
+                component_index=self.component_index[r : r + 1],
+                share=self.share[r : r + 1],
+                begin=None if self.begin is None else self.begin + r * faces,
+            )
+            for r in range(rows)
+        ]
 
     def faces(self, packed: torch.Tensor | Frames) -> torch.Tensor:
         """Takes values of packed faces to rows, [F,...] -> [R,N,...]; frames side by side, [R,N,H*K]."""
@@ -233,6 +252,7 @@ def _view(
         real_components=_real(component_index, device),
         share=torch.tensor([1.0 / min(face_splits, len(garments[g].faces)) for g, _, _ in rows], device=device),
         begin=_begin(face_index),
+        shared=shared and len(rows) > 1,
     )
 
 
