@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
-
-from warpgarment.nn.config import NetworkConfig
 
 from .drawing import Builder
 from .pushforward import Pool
@@ -55,31 +52,6 @@ class Plan:
         return [(int(s), int(t)) for s, t in self._order[step % self.batches]]
 
 
-class Parts(Generic[Batch]):
-    """A batch in parts, each of which is built by the thread that trains on it.
-
-    Args:
-        builds: Functions that build the parts, equal numbers of samples.
-    """
-
-    def __init__(self, builds: Sequence[Callable[[], Batch]]) -> None:
-        self._builds = builds
-        self._built: list[Batch | None] = [None] * len(builds)
-
-    def __len__(self) -> int:
-        return len(self._builds)
-
-    def build(self, number: int) -> Batch:
-        """Builds a part."""
-        part = self._built[number] = self._builds[number]()
-        return part
-
-    def work(self, config: NetworkConfig) -> tuple[int, int]:
-        """Number of samples of the parts that were built, and of operations of a training step on them."""
-        work = [part.work(config) for part in self._built if part is not None]  # type: ignore[attr-defined]
-        return sum(samples for samples, _ in work), sum(operations for _, operations in work)
-
-
 class Loader(Generic[Batch]):
     """Builds the batches of training steps in a thread, up to `depth` of them ahead.
 
@@ -93,8 +65,6 @@ class Loader(Generic[Batch]):
             each garment as the smallest one of the batch has.
         depth: Number of batches built ahead; 0 builds them when they are needed, without a thread.
         part: Slice of the samples of each batch on which this process trains.
-        parts: Number of parts of that slice that `batches` gives one by one, as `Parts`; 1 for a batch in one piece.
-            More than one only without a thread.
     """
 
     def __init__(
@@ -106,9 +76,7 @@ class Loader(Generic[Batch]):
         splits: Callable[[int], int],
         depth: int = 3,
         part: slice = slice(None),
-        parts: int = 1,
     ) -> None:
-        self.parts = parts
         self.builder, self.plan, self.pool, self.share = builder, plan, pool, share
         self.splits, self.depth, self.part = splits, depth, part
         # A separate stream, so that building a batch does not wait for the training step, nor the step for it
@@ -137,19 +105,8 @@ class Loader(Generic[Batch]):
         """Whether enough recorded frames follow a frame of the pool."""
         return self.builder.reaches(*self.pool.entry(rollout, last)[:2])
 
-    def in_parts(self, step: int) -> Parts[Batch]:
-        """The batch of a step in parts that are not built yet."""
-        mine = range(self.plan.batch_size)[self.part]
-        size = len(mine) // self.parts
-        begins = range(mine.start, mine.stop, size)
-        self.plan.picks(step)  # makes the order of the epoch, before threads ask for it
-        return Parts([partial(self.build, step, part=slice(begin, begin + size)) for begin in begins])
-
-    def batches(self, start: int, stop: int) -> Iterator[Batch | Parts[Batch]]:
+    def batches(self, start: int, stop: int) -> Iterator[Batch]:
         """The batches of steps start..stop-1, in order."""
-        if self.parts > 1:
-            yield from map(self.in_parts, range(start, stop))
-            return
         if self.depth == 0:
             yield from map(self.build, range(start, stop))
             return

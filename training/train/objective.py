@@ -9,20 +9,17 @@ makes copies, stay float32.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from warpgarment.kernels import threads
 from warpgarment.nn.inputs import RowInputs
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import NetworkOutput
 from warpgarment.nn.run import run
 from warpgarment.training.distributed import Group
-from warpgarment.training.samples.loader import Parts
 from warpgarment.training.samples.outfits import OutfitBatch
 from warpgarment.training.samples.single_step import Batch
 from warpgarment.training.samples.unrolled import UnrolledBatch
@@ -113,11 +110,8 @@ class Trainer:
         if group.size > 1:
             self._model = DistributedDataParallel(objective, gradient_as_bucket_view=True)
 
-    def backward(self, batch: Batch | UnrolledBatch | OutfitBatch | Parts[Any]) -> torch.Tensor:
+    def backward(self, batch: Batch | UnrolledBatch | OutfitBatch) -> torch.Tensor:
         """Computes the gradient of the weights; the host does not wait for the device.
-
-        Parts of a batch are shared among threads, if there are enough of them, and in any case worked on with the same
-        bits. Their randomness must be their own.
 
         Returns:
             The losses of this process, in the order of the objective's `figures`.
@@ -126,8 +120,6 @@ class Trainer:
             CompileFailed: The compiler is missing, on the first step.
         """
         try:
-            if isinstance(batch, Parts):
-                return self._in_parts(batch)
             losses = self._model(*self._inputs(batch))
             losses[0].backward()
         except Exception as error:
@@ -140,28 +132,3 @@ class Trainer:
             ) from error
         self._worked = True
         return losses.detach()
-
-    def _in_parts(self, batch: Parts[Any]) -> torch.Tensor:
-        """The same for the mean of the losses of the parts; adds to no gradient that there is."""
-        parameters = [parameter for parameter in self._model.parameters() if parameter.requires_grad]
-        found: list[tuple[torch.Tensor, ...]] = [()] * len(batch)
-
-        def work(number: int) -> None:
-            losses = self._model(*self._inputs(batch.build(number)))
-            gradients = torch.autograd.grad(losses[0], parameters, allow_unused=True, materialize_grads=True)
-            found[number] = losses.detach(), *gradients
-
-        calls = [partial(work, number) for number in range(len(batch))]
-        if not self._worked:  # kernels are loaded in one thread
-            for call in calls:
-                call()
-        else:
-            with threads.torch_on_one():
-                threads.spread(calls)
-        total = list(found[0])
-        for more in found[1:]:
-            torch._foreach_add_(total, list(more))
-        torch._foreach_div_(total, float(len(batch)))
-        for parameter, gradient in zip(parameters, total[1:], strict=True):
-            parameter.grad = gradient
-        return total[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 import math
 import time
@@ -14,7 +15,6 @@ import torch
 from tqdm import tqdm
 
 from warpgarment.io.npz import write_npz
-from warpgarment.kernels import threads
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.faces.grow import untrained
@@ -22,7 +22,7 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.training.distributed import Group
 from warpgarment.training.rollouts import predict
 from warpgarment.training.samples.drawing import Builder
-from warpgarment.training.samples.loader import Loader, Parts, Plan
+from warpgarment.training.samples.loader import Loader, Plan
 from warpgarment.training.samples.outfits import OutfitBatch, OutfitBuilder
 from warpgarment.training.samples.pushforward import Pool
 from warpgarment.training.samples.single_step import Batch, SampleBuilder
@@ -76,7 +76,7 @@ class Run:
     ) -> None:
         self.config, self.network, self.validation, self.began = config, network, validation, began
         self.out, self.group, self.device = Path(config.out), group, group.device
-        self.builder, self.pool, part, parts = builder, Pool(), group.part(config.batch_size), 1
+        self.builder, self.pool, part = builder, Pool(), group.part(config.batch_size)
         steps, passes, ahead = config.unroll.steps, config.unroll.collision_passes, config.ahead
         chosen: Builder[Any] = builder
         self.positions = isinstance(builder, OutfitBuilder)
@@ -85,10 +85,7 @@ class Run:
         elif steps > 1:
             chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
             ahead = 0  # the solvers of a scene must stay in one thread
-            random = config.noise.features or network.config.dropout
-            if group.size == 1 and self.device.type == "cpu" and not random:
-                parts = config.batch_size if 1 < threads.count() <= config.batch_size else 1  # garments are shared
-        self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part, parts)
+        self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
@@ -190,6 +187,7 @@ class Run:
         hidden = not self.group.first
         bar = tqdm(total=config.steps, initial=self.step, unit="step", mininterval=5.0, disable=hidden)
         self.network.train()
+        settled = False
         while not self.over():
             self.refresh_pool()
             until = min(last, *(n * (self.step // n + 1) for n in self._periods()))
@@ -197,6 +195,9 @@ class Run:
             for batch in self.loader.batches(self.step, until):
                 self.update(batch)
                 self.step += 1
+                if not settled:  # all is loaded that later collections of garbage need not look at
+                    gc.freeze()
+                    settled = True
                 bar.update()
                 if self.step % self.read_every == 0:
                     self.read_losses()
@@ -214,7 +215,7 @@ class Run:
             self.look_at_clock()
         bar.close()
 
-    def update(self, batch: Batch | UnrolledBatch | OutfitBatch | Parts[Any]) -> None:
+    def update(self, batch: Batch | UnrolledBatch | OutfitBatch) -> None:
         """One step of the optimiser; the host does not wait for the device."""
         config, network = self.config, self.network
         torch.manual_seed(config.seed * 1_000_003 + self.step + 2**40 * self.group.rank)  # dropout and feature noise

@@ -10,17 +10,13 @@ from support import sequences as synthetic_sequences
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.faces.network import ManifoldAwareTransformer
 from warpgarment.training.data.sequence import Sequence
-from warpgarment.training.distributed import Group
 from warpgarment.training.samples import interactions
 from warpgarment.training.samples.augmentation import Augmentation
-from warpgarment.training.samples.loader import Loader, Plan
 from warpgarment.training.samples.noise import NoiseConfig
-from warpgarment.training.samples.pushforward import Pool
 from warpgarment.training.samples.recorded import SequenceData
 from warpgarment.training.samples.scenes import Scenes
 from warpgarment.training.samples.unrolled import UnrolledBuilder
 from warpgarment.training.train.losses import LossConfig
-from warpgarment.training.train.objective import Trainer
 from warpgarment.training.train.unrolled_objective import UnrollConfig, UnrolledObjective
 
 SMALL = NetworkConfig.small(embedding=16, layers=1, feed_forward=16, heads=2, dropout=0.0, geodesic_radius=0.2)
@@ -80,34 +76,6 @@ def test_a_scene_is_not_taken_from_a_batch_that_lives(loaded):
     assert store.take("a") is None
     assert store.take("c") is kept
     assert store.take("c") is None
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_parts_in_threads_are_the_whole_batch(loaded, count):
-    """Garments that threads share would have other losses or gradients than in one call, or threads other bits. 1e-4:
-    sums of float32 in another order, over three steps."""
-    network = network_of()
-    builder = UnrolledBuilder(loaded, network, NoiseConfig(), Augmentation(), 3, 1)
-    plan = Plan([len(data.faces) for data in loaded], [np.array([3, 9]), np.array([5, 10])], 4, 0)
-    loader = Loader(builder, plan, Pool(), 0.0, lambda step: 1, 0, slice(None), 4)
-    objective = UnrolledObjective(network, LossConfig(), 0.0, "float32", UnrollConfig(steps=3, position=1.0))
-    trainer, before = Trainer(objective, Group("cpu"), False), torch.get_num_threads()
-    whole = objective(loader.build(0))
-    expected = [whole, *torch.autograd.grad(whole[0], list(network.parameters()), materialize_grads=True)]
-    found = []
-    torch.set_num_threads(count)
-    try:
-        for _ in range(3):  # the first in one thread
-            (batch,) = loader.batches(0, 1)
-            losses = trainer.backward(batch)
-            assert batch.work(network.config)[0] == 4
-            found.append([losses, *[parameter.grad.clone() for parameter in network.parameters()]])
-    finally:
-        torch.set_num_threads(before)
-    for one, other in zip(found[0], expected, strict=True):
-        torch.testing.assert_close(one, other.detach(), rtol=1e-3, atol=1e-4 * float(other.detach().abs().max()))
-    for again in found[1:]:
-        assert all(torch.equal(one, other) for one, other in zip(again, found[0], strict=True))
 
 
 def test_bodies_of_samples_are_those_of_the_sequence(loaded):
