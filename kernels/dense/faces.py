@@ -8,7 +8,7 @@ A thread works on a block of 32 faces of a row. With n(x) = (x - mean) / deviati
     hear       x = x + V gelu(W [own, mean of own over three neighbours] + b) + c,  own' = n(x)
     head       answer = W own + b
 
-The scale and shift of a layer norm belong to the W and b after it: see `warpgarment/nn/patches/tiled.py`. Arrays of R
+The scale and shift of a layer norm belong to the W and b after it: see `warpgarment/nn/patches/fused.py`. Arrays of R
 rows are padded to N faces. Those that describe garments may have one row, which then serves all.
 """
 

@@ -7,18 +7,15 @@ room for. A row of a product depends on no other row, so results do not depend o
 thread computes them. There are several kinds, of which a process uses one:
 
 **Vectors.** Tiles hold float32 numbers, row by row. Eight rows of a and two tiles of b make sixteen sums, which stay in
-registers; with AVX2 and NEON, which have half as many, four rows and one tile. `Vector` is that of vectors.py.
+registers; with AVX2 and NEON, six or four rows and one tile. `Vector` is that of vectors.py.
 
 **Tiles of AMX.** A float32 number is the sum of two of bfloat16, up to 2^-17 of its size, so a product is the sum of
 three products of bfloat16, added up in float32 by the tiles of the processor:
 
     x = hi + lo        x y = hi hi' + hi lo' + lo hi'  (+ lo lo', which is left out: 2^-18 of x y)
 
-**Integers.** The layers between those whose inputs or outputs are physical quantities can do with less. `Inner` is
-`Matrix` again, but on processors with VNNI (AVX-512), which multiply pairs of 16-bit integers as fast as single
-float32 numbers. Each row of a and each column of b is divided by a number of its own, such that no number is beyond
-2^15 and the norm of none beyond 46,300. By the inequality of Cauchy and Schwarz no sum of products then leaves 32
-bits, so sums are exact. A number of a row of 128 is off by 1e-4 of the row's deviation.
+**Integers.** The layers between those whose inputs or outputs are physical quantities can do with less: `Inner` is
+`Matrix` again, but on processors with VNNI its products are of 16-bit integers (integers.py).
 
 | C++ | what |
 | --- | --- |
@@ -47,6 +44,7 @@ import warp as wp
 from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, flat_argument
 
+from . import integers
 from .vectors import TEXT
 
 wp.set_module_options(compiling.options())
@@ -55,7 +53,6 @@ BLOCK = 32  # rows of a block: two tiles of AMX
 STEP = 32  # rows of a tile: widths are padded to a multiple of it
 WIDEST = 256  # most columns of a layer, for which blocks have room
 COLUMNS = 16  # of a tile
-LONGEST = 46_300.0  # norm of a row or column of integers: with rounding, less than the root of 2^31
 
 _TILES_GUARD = """
 #if defined(__AMX_TILE__) && defined(__AMX_BF16__) && defined(__AVX512F__) && defined(__AVX512BF16__)
@@ -234,72 +231,6 @@ struct Inner {
 };
 """
 
-_INTEGERS_GUARD = """
-#if defined(__AVX512F__) && defined(__AVX512BW__) && defined(__AVX512VNNI__)
-"""
-_INTEGERS = """
-typedef short s16 __attribute__((vector_size(32), aligned(2)));
-#define INNER(a, n) alignas(64) short a##_all[n]; float a##_unit[32]; const Inner::Left a = {a##_all, a##_unit}
-struct Inner {
-    struct Left {
-        short* all;
-        float* unit;  // of each row
-        inline void row(int i, const float* x, int width) const {
-            v16 square = {}, most = {};
-            for (int j = 0; j < width; j += 16) {
-                v16 y = Vector::load(x + j);
-                square = Vector::fma(y, y, square);
-                most = __builtin_elementwise_max(most, __builtin_elementwise_abs(y));
-            }
-            const float largest = __builtin_reduce_max(most) / 32767.0f;
-            float u = __builtin_sqrtf(Vector::total(square)) / 46300.0f;
-            u = largest > u ? largest : u;
-            if (!(u < 1.0e30f)) {  // a number that is not finite: so are the products
-                unit[i] = __builtin_nanf("");
-                __builtin_memset(all + (long)i * width, 0, 2l * width);
-                return;
-            }
-            u = u > 1.0e-30f ? u : 1.0e-30f;
-            unit[i] = u;
-            const v16 over = Vector::all(1.0f / u), half = Vector::all(12582912.0f);
-            for (int j = 0; j < width; j += 16) {
-                i16 whole = (i16)(Vector::load(x + j) * over + half) - (i16)half;  // rounds to the nearest
-                *(s16*)(all + (long)i * width + j) = __builtin_convertvector(whole, s16);
-            }
-        }
-    };
-    // after the tiles of b, [pair of rows, column, row of the pair], are the units of its columns
-    static inline long size(int columns, int rows) { return (long)columns * (rows / 2 + 1); }
-    static void product(Left a, int lda, const float* right, int depth, int columns, float* c, int ldc,
-                        int down = 32) {
-        const float* units = right + (long)columns * depth * 16;
-        for (int n = 0; n < columns; n += 32) {
-            const int* b = (const int*)right + (long)(n / 16) * depth * 256;
-            const int* next = b + (long)depth * 256;
-            for (int m = 0; m < down; m += 8) {
-                const int* x = (const int*)(a.all + (long)m * lda);
-                i16 sum[8][2];
-                for (int i = 0; i < 8; i++) sum[i][0] = sum[i][1] = i16{};
-                for (int k = 0; k < 16 * depth; k++) {
-                    const i16 y = *(const i16*)(b + 16 * k), z = *(const i16*)(next + 16 * k);
-                    for (int i = 0; i < 8; i++) {
-                        const i16 one = x[(long)i * (lda / 2) + k] - i16{};
-                        sum[i][0] = __builtin_ia32_vpdpwssd512(sum[i][0], one, y);
-                        sum[i][1] = __builtin_ia32_vpdpwssd512(sum[i][1], one, z);
-                    }
-                }
-                for (int i = 0; i < 8; i++)
-                    for (int j = 0; j < 2; j++) {
-                        float* to = c + (long)(m + i) * ldc + n + 16 * j;
-                        const v16 u = Vector::load(units + n + 16 * j) * Vector::all(a.unit[m + i]);
-                        Vector::store(to, Vector::fma(__builtin_convertvector(sum[i][j], v16), u, Vector::load(to)));
-                    }
-            }
-        }
-    }
-};
-"""
-
 
 @functools.cache
 def tiles_present() -> bool:
@@ -315,12 +246,12 @@ ON_TILES = tiles_present() and os.environ.get("WARPGARMENT_TILES") != "0"
 """Whether this process multiplies on tiles of AMX; the environment can say no, with WARPGARMENT_TILES=0."""
 INTEGERS = not ON_TILES and bool(getattr(torch.cpu, "_is_vnni_supported", bool)())
 """Whether inner layers are products of integers in this process."""
-_GUARD = _TILES_GUARD if ON_TILES else _INTEGERS_GUARD if INTEGERS else _VECTORS_GUARD
+_GUARD = _TILES_GUARD if ON_TILES else integers.GUARD if INTEGERS else _VECTORS_GUARD
 
 
 def source(body: str) -> str:
     """The text of a native function that uses `Vector`, `Matrix` and `Inner`; it does nothing where there are none."""
-    inner = _INTEGERS if INTEGERS else _INNER
+    inner = integers.TEXT if INTEGERS else _INNER
     return _GUARD + TEXT + (_TILES if ON_TILES else _VECTORS) + inner + body + "\n#endif\n"
 
 
@@ -388,10 +319,7 @@ def pack_inner(weight: torch.Tensor) -> torch.Tensor:
     """
     if not INTEGERS:
         return pack(weight).flatten()
-    unit = torch.maximum(weight.norm(dim=1) / LONGEST, weight.abs().amax(dim=1) / 32767.0).clamp(min=1e-30)
-    whole = torch.round(weight / unit[:, None]).to(torch.int16)
-    tiles = whole.unflatten(0, (-1, COLUMNS)).unflatten(2, (-1, STEP // 2, 2)).permute(0, 2, 3, 1, 4)
-    return torch.cat([tiles.flatten().view(torch.float32), unit])
+    return integers.pack(weight)
 
 
 _TYPES = {torch.float32: wp.float32, torch.int32: wp.int32, torch.int64: wp.int64, torch.uint8: wp.uint8}
