@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import torch
 
 
 def allocated(call) -> int:
     """The most bytes that torch had allocated at a time, above what it had before."""
+    gc.collect()  # what earlier tests left would be given back within the call, as memory that it does not take
     activities = [torch.profiler.ProfilerActivity.CPU]
     with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
         call()

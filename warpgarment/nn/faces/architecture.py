@@ -18,7 +18,7 @@ from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.flops import layer_flops
 from warpgarment.nn.inputs import NetworkSizes
 from warpgarment.nn.network import GarmentNetwork
-from warpgarment.nn.rows import activation_bytes, row_groups
+from warpgarment.nn.rows import SMALL, activation_bytes, first_equal, row_groups
 from warpgarment.objects.garment import Garment
 
 from .grow import added
@@ -86,17 +86,19 @@ class Faces(Architecture):
     def memory(self, sizes: NetworkSizes, config: NetworkConfig) -> dict[str, int]:
         """Bytes of geodesic weights, of the distances they are made from (on a CPU), and of a call of the network."""
         garments, stack = sizes.garments, 4 * (config.history * FEATURES + OUTDOOR.width)
-        weights, largest, network = 0, 0, 0
+        weights, largest, network, equal = 0, 0, 0, first_equal(garments)
         for group in row_groups(garments, config, sizes.face_splits, cpu=sizes.cpu):
             length, matrices, pooled = max(count for _, _, count in group), 0, garments[group[0][0]].pools
+            alike = len({(equal[g], first) for g, first, _ in group}) == 1
             if config.manifold_heads:
-                rows = 1 if len({(id(garments[g]), first) for g, first, _ in group}) == 1 else len(group)
+                rows = 1 if alike else len(group)
                 each = self.entries(garments[group[0][0]], length, config)
-                distinct = len({id(garments[g]) for g, _, _ in group}) if pooled else rows
+                distinct = len({equal[g] for g, _, _ in group}) if pooled else rows
                 matrices, largest = each * distinct, max(largest, 4 * each)
                 weights += 4 * matrices
                 weights += rows * (length * (2 * NEAR * BAG_ENTRY + 12) + 8 * CENTRES) if pooled else 0
-            tokens = len(group) * length
+            one_by_one = sizes.cpu and not sizes.half and alike and length > SMALL  # see `PaddedView.one_by_one`
+            tokens = length if one_by_one else len(group) * length
             activations = activation_bytes(tokens, stack, STACKS, config.embedding, config.feed_forward, sizes.half)
             network = max(network, activations + (2 * matrices if sizes.half and not pooled else 0))
         distances = 0
