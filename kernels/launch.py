@@ -103,12 +103,7 @@ def flat_argument(tensor: torch.Tensor, dtype: type) -> object:
     if not tensor.is_contiguous() or tensor.numel() == 0:
         return as_argument(tensor.reshape(-1), dtype)
     key = (tensor.numel(), dtype)
-    like = _descriptors.get(key)
-    if like is None:
-        return descriptor(tensor.reshape(-1), dtype, key)
-    made = cast(Any, type(like)).from_buffer_copy(like)
-    made.data = tensor.data_ptr()
-    return made
+    return descriptor(tensor if key in _descriptors else tensor.reshape(-1), dtype, key)
 
 
 def rows_in_memory(rows: torch.Tensor) -> tuple[torch.Tensor, int]:

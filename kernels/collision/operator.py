@@ -180,25 +180,6 @@ def _(
     return torch.empty_like(grad, memory_format=torch.contiguous_format)
 
 
-def solved(
-    vertices: torch.Tensor,
-    normal: torch.Tensor,
-    anchor: torch.Tensor,
-    distance: torch.Tensor,
-    tolerance: torch.Tensor,
-    model: list[torch.Tensor],
-    max_iterations: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """`collision_solve` past torch's dispatcher, which takes a millisecond for the list of a solver."""
-    given = vertices, normal, anchor, distance, tolerance, model, max_iterations
-    if torch.compiler.is_compiling():
-        return collision_solve(*given)
-    if torch.is_grad_enabled() and vertices.requires_grad:
-        result: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Solve.apply(*given)
-        return result
-    return collision_solve.function(*given)
-
-
 class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *given: Any) -> tuple[torch.Tensor, ...]:
@@ -212,6 +193,12 @@ class _Solve(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor, *_: None) -> tuple[Any, ...]:
         given = ctx.normal, ctx.tolerance, ctx.model, ctx.max_iterations
         return collision_solve_backward.function(gradient, *given), None, None, None, None, None, None
+
+
+def solved(*given: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`collision_solve` past torch's dispatcher, of the same arguments."""
+    result: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = collision_solve.directly(_Solve, *given)
+    return result
 
 
 def _unpacked(model: list[torch.Tensor]) -> Model:

@@ -243,25 +243,6 @@ def _(
     )
 
 
-def solved(
-    phi: torch.Tensor,
-    mean: torch.Tensor,
-    pin_target: torch.Tensor,
-    initial: torch.Tensor,
-    model: list[torch.Tensor],
-    max_iterations: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """`poisson_solve` past torch's dispatcher, which takes a millisecond for the list of a solver."""
-    if torch.compiler.is_compiling():
-        return poisson_solve(phi, mean, pin_target, initial, model, max_iterations)
-    if torch.is_grad_enabled() and (phi.requires_grad or mean.requires_grad or pin_target.requires_grad):
-        result: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Solve.apply(
-            phi, mean, pin_target, initial, model, max_iterations
-        )
-        return result
-    return poisson_solve.function(phi, mean, pin_target, initial, model, max_iterations)
-
-
 class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *given: Any) -> tuple[torch.Tensor, ...]:
@@ -274,6 +255,12 @@ class _Solve(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor, *_: None) -> tuple[Any, ...]:
         return *poisson_solve_backward.function(gradient, ctx.mean, ctx.model, ctx.max_iterations), None, None, None
+
+
+def solved(*given: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`poisson_solve` past torch's dispatcher, of the same arguments."""
+    result: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = poisson_solve.directly(_Solve, *given)
+    return result
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:

@@ -28,7 +28,7 @@ class FrameInputs(NamedTuple):
 
     `previous`, `previous_body`, `materials`, `wind`, `pairs` and `skin` are None unless the network `reads` them; it
     gets `previous_body` with `previous`. `materials` and `wind` may be None all the same. `features` are `Frames` only
-    for networks with the `predict` of `GarmentNetwork`.
+    for networks with `takes_frames`.
     """
 
     features: torch.Tensor | Frames  # [F,H,K] oldest first, all channels of kernels/features/channels.py

@@ -178,10 +178,9 @@ class Scene:
             body_vertices: Bodies in the first frame [m], packed, shape [U,3].
             first_vertices: Garments in the first frame [m], packed, shape [V,3].
         """
-        self.stacks = Stacks()
-        self.reconstruct.hold(first_vertices, self.bodies.at(body_vertices))
         if self.skin is not None:
             raise ValueError("a scene of a network that reads the skin begins once")
+        self.reconstruct.hold(first_vertices, self.bodies.at(body_vertices))
 
     def _refuse_far(self, vertices: torch.Tensor, body_of_vertex: torch.Tensor) -> None:
         """Raises MeshError for a garment whose vertices are all more than `FARTHEST` from its body."""
