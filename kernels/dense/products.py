@@ -9,10 +9,7 @@ thread computes them. There are several kinds, of which a process uses one:
 **Vectors.** Tiles hold float32 numbers, row by row. Eight rows of a and two tiles of b make sixteen sums, which stay in
 registers; with AVX2 and NEON, six or four rows and one tile. `Vector` is that of vectors.py.
 
-**Tiles of AMX.** A float32 number is the sum of two of bfloat16, up to 2^-17 of its size, so a product is the sum of
-three products of bfloat16, added up in float32 by the tiles of the processor:
-
-    x = hi + lo        x y = hi hi' + hi lo' + lo hi'  (+ lo lo', which is left out: 2^-18 of x y)
+**Tiles of AMX.** Products are sums of three of bfloat16, on the tiles of the processor (tiles.py).
 
 **Integers.** The layers between those whose inputs or outputs are physical quantities can do with less: `Inner` is
 `Matrix` again, but on processors with VNNI its products are of 16-bit integers (integers.py).
@@ -44,7 +41,7 @@ import warp as wp
 from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, flat_argument
 
-from . import integers
+from . import integers, tiles
 from .vectors import TEXT
 
 wp.set_module_options(compiling.options())
@@ -53,99 +50,6 @@ BLOCK = 32  # rows of a block: two tiles of AMX
 STEP = 32  # rows of a tile: widths are padded to a multiple of it
 WIDEST = 256  # most columns of a layer, for which blocks have room
 COLUMNS = 16  # of a tile
-
-_TILES_GUARD = """
-#if defined(__AMX_TILE__) && defined(__AMX_BF16__) && defined(__AVX512F__) && defined(__AVX512BF16__)
-"""
-_TILES = """
-typedef __bf16 h16 __attribute__((vector_size(32), aligned(2)));
-typedef __bf16 h32 __attribute__((vector_size(64), aligned(2)));
-#define LEFT(a, n) alignas(64) __bf16 a##_hi[n], a##_lo[n]; const Matrix::Left a = {a##_hi, a##_lo}
-struct Matrix {
-    static inline void split(v16 x, __bf16* hi, __bf16* lo) {
-        h16 h = __builtin_convertvector(x, h16);
-        *(h16*)hi = h;
-        *(h16*)lo = __builtin_convertvector(x - __builtin_convertvector(h, v16), h16);
-    }
-    struct Left {
-        __bf16 *hi, *lo;
-        inline void put(long i, v16 x) const { split(x, hi + i, lo + i); }
-        inline Left after(long i) const { return {hi + i, lo + i}; }
-    };
-    static inline void rows(float* tile, int k, v16 x, v16 y) {  // two rows are a row of pairs
-        alignas(64) __bf16 both[2][2][16];
-        split(x, both[0][0], both[1][0]);
-        split(y, both[0][1], both[1][1]);
-        for (int part = 0; part < 2; part++)
-            *(h32*)((__bf16*)tile + 512 * part + 16 * k) = __builtin_shufflevector(
-                *(h16*)both[part][0], *(h16*)both[part][1], 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23, 8,
-                24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
-    }
-    static inline void column(float* tile, int n, v16 x, v16 y) {  // 32 numbers are a column of pairs
-        alignas(64) __bf16 both[2][32];
-        split(x, both[0], both[1]);
-        split(y, both[0] + 16, both[1] + 16);
-        for (int part = 0; part < 2; part++)
-            for (int pair = 0; pair < 16; pair++)
-                ((int*)tile)[256 * part + 16 * pair + n] = ((int*)both[part])[pair];
-    }
-    static void begin() {
-        alignas(64) unsigned char c[64] = {0};
-        c[0] = 1;
-        for (int t = 0; t < 8; t++) {
-            c[16 + 2 * t] = 64;
-            c[48 + t] = 16;
-        }
-        __builtin_ia32_tile_loadconfig(c);
-    }
-    static void end() { __builtin_ia32_tilerelease(); }
-    // a has lda numbers a row; b is packed with `depth` steps in all, of which the first is `from`; rows of c beyond
-    // `down` need not be computed
-    static void product(Left a, int lda, const float* right, int from, int steps, int depth, int columns, float* c,
-                        int ldc, int = 32) {
-        const __bf16 *hi = a.hi, *lo = a.lo, *b = (const __bf16*)right;
-        long down = 16 * (long)lda, a_row = 2 * (long)lda, c_row = 4 * (long)ldc;
-        for (int n = 0; n < columns; n += 32) {
-            const __bf16* b0 = b + ((long)(n / 16) * depth + from) * 1024;
-            const __bf16* b1 = b0 + (long)depth * 1024;
-            float* c0 = c + n;
-            float* c1 = c0 + 16 * (long)ldc;
-            __builtin_ia32_tileloadd64(0, c0, c_row);
-            __builtin_ia32_tileloadd64(1, c0 + 16, c_row);
-            __builtin_ia32_tileloadd64(2, c1, c_row);
-            __builtin_ia32_tileloadd64(3, c1 + 16, c_row);
-            for (int k = 0; k < steps; k++, b0 += 1024, b1 += 1024) {
-                __builtin_ia32_tileloadd64(4, hi + 32 * k, a_row);
-                __builtin_ia32_tileloadd64(6, b0, 64);
-                __builtin_ia32_tdpbf16ps(0, 4, 6);
-                __builtin_ia32_tileloadd64(7, b1, 64);
-                __builtin_ia32_tdpbf16ps(1, 4, 7);
-                __builtin_ia32_tileloadd64(5, hi + down + 32 * k, a_row);
-                __builtin_ia32_tdpbf16ps(2, 5, 6);
-                __builtin_ia32_tdpbf16ps(3, 5, 7);
-                __builtin_ia32_tileloadd64(6, b0 + 512, 64);
-                __builtin_ia32_tdpbf16ps(0, 4, 6);
-                __builtin_ia32_tdpbf16ps(2, 5, 6);
-                __builtin_ia32_tileloadd64(7, b1 + 512, 64);
-                __builtin_ia32_tdpbf16ps(1, 4, 7);
-                __builtin_ia32_tdpbf16ps(3, 5, 7);
-                __builtin_ia32_tileloadd64(4, lo + 32 * k, a_row);
-                __builtin_ia32_tileloadd64(6, b0, 64);
-                __builtin_ia32_tdpbf16ps(0, 4, 6);
-                __builtin_ia32_tileloadd64(7, b1, 64);
-                __builtin_ia32_tdpbf16ps(1, 4, 7);
-                __builtin_ia32_tileloadd64(5, lo + down + 32 * k, a_row);
-                __builtin_ia32_tdpbf16ps(2, 5, 6);
-                __builtin_ia32_tdpbf16ps(3, 5, 7);
-            }
-            __builtin_ia32_tilestored64(0, c0, c_row);
-            __builtin_ia32_tilestored64(1, c0 + 16, c_row);
-            __builtin_ia32_tilestored64(2, c1, c_row);
-            __builtin_ia32_tilestored64(3, c1 + 16, c_row);
-        }
-    }
-};
-"""
 
 _VECTORS_GUARD = """
 #if defined(__AVX512F__) || (defined(__AVX2__) && defined(__FMA__)) || (defined(__aarch64__) && defined(__ARM_NEON))
@@ -232,27 +136,18 @@ struct Inner {
 """
 
 
-@functools.cache
-def tiles_present() -> bool:
-    """Whether this processor has the tiles of AMX, and the system lets this process use them."""
-    names = "_is_amx_tile_supported", "_is_avx512_bf16_supported", "_init_amx"
-    asked = [getattr(torch.cpu, name, None) for name in names]
-    if platform.machine() not in ("x86_64", "AMD64") or not all(asked):
-        return False
-    return all(ask() for ask in asked if ask is not None)
-
-
-ON_TILES = tiles_present() and os.environ.get("WARPGARMENT_TILES") != "0"
+ON_TILES = tiles.present() and os.environ.get("WARPGARMENT_TILES") != "0"
 """Whether this process multiplies on tiles of AMX; the environment can say no, with WARPGARMENT_TILES=0."""
-INTEGERS = not ON_TILES and bool(getattr(torch.cpu, "_is_vnni_supported", bool)())
+_asked = [getattr(torch.cpu, name, bool) for name in ("_is_vnni_supported", "_is_avx512_supported")]
+INTEGERS = not ON_TILES and all(ask() for ask in _asked)
 """Whether inner layers are products of integers in this process."""
-_GUARD = _TILES_GUARD if ON_TILES else integers.GUARD if INTEGERS else _VECTORS_GUARD
+_GUARD = tiles.GUARD if ON_TILES else integers.GUARD if INTEGERS else _VECTORS_GUARD
 
 
 def source(body: str) -> str:
     """The text of a native function that uses `Vector`, `Matrix` and `Inner`; it does nothing where there are none."""
     inner = integers.TEXT if INTEGERS else _INNER
-    return _GUARD + TEXT + (_TILES if ON_TILES else _VECTORS) + inner + body + "\n#endif\n"
+    return _GUARD + TEXT + (tiles.TEXT if ON_TILES else _VECTORS) + inner + body + "\n#endif\n"
 
 
 @functools.cache
@@ -301,10 +196,7 @@ def pack(weight: torch.Tensor) -> torch.Tensor:
     whole = torch.nn.functional.pad(weight, (0, padded(inputs) - inputs, 0, padded(outputs) - outputs))
     if not ON_TILES:
         return whole.unflatten(0, (-1, COLUMNS)).unflatten(2, (-1, STEP)).permute(0, 2, 3, 1).flatten(2)
-    high = whole.to(torch.bfloat16)
-    both = torch.stack([high, (whole - high.float()).to(torch.bfloat16)])
-    tiles = both.unflatten(1, (-1, 16)).unflatten(3, (-1, 16, 2))  # [2, O/16, 16, I/32, 16, 2]
-    return tiles.permute(1, 3, 0, 4, 2, 5).flatten(2).view(torch.float32)
+    return tiles.pack(whole)
 
 
 def pack_inner(weight: torch.Tensor) -> torch.Tensor:
