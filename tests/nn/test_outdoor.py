@@ -95,7 +95,7 @@ def test_added_channels_change_nothing_at_first(kind):
     training and in a rollout.
 
     Bit for bit, but for the network of faces: its inputs are longer rows of one product, which some matrix libraries
-    add up in another order. Measured: 2e-6 m after fourteen frames.
+    add up in another order. Measured: 1e-5 m after fourteen frames.
     """
     network = checkpoint.load(checkpoint.find({"faces": "small", "patches": "fast"}[kind]))
     config = dataclasses.replace(network.config, outdoor=OUTDOOR.names)
@@ -107,7 +107,7 @@ def test_added_channels_change_nothing_at_first(kind):
     expected = Simulator(network, "cpu").rollout(garment, walk(14))
     found = Simulator(more, "cpu").rollout(garment, walk(14), **given)
     assert np.abs(expected.vertices[-1] - expected.vertices[0]).max() > 0.01
-    assert np.abs(found.vertices - expected.vertices).max() <= (1e-4 if kind == "faces" else 0.0)
+    assert np.abs(found.vertices - expected.vertices).max() <= (3e-5 if kind == "faces" else 0.0)
     features = torch.randn(1, len(garment.faces), 10 * FEATURES)
     shape = architecture(kind)
     weights = shape.rows([(shape.geometry(garment, config), None)], config, torch.device("cpu"))
@@ -118,7 +118,7 @@ def test_added_channels_change_nothing_at_first(kind):
     assert (a.psi - torch.eye(3)).abs().max() > 1e-3
     # longer sums in the first layer, here in one product; of which integers in later ones may be rounded otherwise
     rounded = kind == "patches" and INTEGERS
-    torch.testing.assert_close(b, a, rtol=1e-6, atol=2e-3 if rounded else 1e-7)
+    torch.testing.assert_close(b, a, rtol=1e-6, atol=5e-5 if rounded else 1e-7)
     assert architecture(kind).start_from(more, more.config, grow=False) is more
 
 

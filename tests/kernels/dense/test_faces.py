@@ -12,7 +12,7 @@ from warpgarment.kernels.dense.turned import turned
 pytestmark = pytest.mark.skipif(not products.available(), reason="this processor has no vectors")
 
 ROWS, COUNT, WIDTH, HIDDEN = 2, 75, 96, 64  # 75 faces: two blocks of 32 and one of 11
-OFF = 1e-4 if products.ON_TILES else 1e-3 if products.INTEGERS else 1e-5
+OFF = 1e-4 if products.ON_TILES else 7e-4 if products.INTEGERS else 1e-5
 """On tiles, products of numbers around one lose 2^-17 of each term: 1e-5 in a sum of a hundred; bfloat16 alone 1e-2.
 
 Numbers of rows of integers are off by 6e-5 of their deviation, sums of two layers by four times that at most."""

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.skipif(not products.available(), reason="this processor
 
 ROWS, COUNT, WIDTH, EMBEDDING, HIDDEN, HEAD, LAYERS = 2, 90, 32, 96, 64, 32, 2
 PATCHES, PIECES = 41, 3  # 44 tokens: a block of 32, and one of 12 that has patches and velocities
-OFF = 3e-5 if products.ON_TILES else 1e-3 if products.INTEGERS else 5e-6
+OFF = 3e-5 if products.ON_TILES else 3e-4 if products.INTEGERS else 5e-6
 """Of the largest output: products on tiles lose 2^-17 of each term, 8e-6, in each of a dozen. bfloat16 alone: 1e-2.
 
 Integers of rows of 96 are 6e-5 of their deviation off."""
