@@ -155,7 +155,9 @@ def launch_rows(
         recorded.launch(kernel, rows, [0, *inputs, *outputs], device)
         return
     begins = [rows * part // parts for part in range(parts + 1)]
-    threads.spread(recorded.divided(kernel, begins, [*inputs, *outputs], device))
+    calls = recorded.divided(kernel, begins, [*inputs, *outputs], device)
+    recorded.note(calls)
+    threads.spread(calls)
 
 
 def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> None:

@@ -14,13 +14,17 @@ recorded on a `wp.Tape`: kernels are differentiated by operators of torch.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import itertools
 import threading
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
+
+if TYPE_CHECKING:
+    from .replay import Recording
 
 MOST_BOUNDS = 4096
 
@@ -78,6 +82,30 @@ class Record:
         return self.filled(values)
 
 
+class _Notes(threading.local):
+    recording: Recording | None = None
+
+
+notes = _Notes()
+"""What this thread records, see `replay.py`."""
+
+
+@contextlib.contextmanager
+def noted(recording: Recording) -> Iterator[None]:
+    """Context in which the launches of this thread are given to a recording."""
+    notes.recording = recording
+    try:
+        yield
+    finally:
+        notes.recording = None
+
+
+def note(calls: Sequence[Launch]) -> None:
+    """Gives launches that are independent of each other to what is recorded, if anything is."""
+    if notes.recording is not None:
+        notes.recording.launches(calls)
+
+
 _records: dict[wp.Kernel, Record] = {}
 _adjoints: dict[wp.Kernel, Record] = {}
 _recording = threading.Lock()  # Warp compiles and loads a module in one thread
@@ -93,7 +121,9 @@ def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp
             the types of its first launch.
         device: The CPU.
     """
-    prepared(kernel, rows, arguments, device)()
+    work = prepared(kernel, rows, arguments, device)
+    note([work])
+    work()
 
 
 def prepared(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> Launch:

@@ -126,12 +126,13 @@ class CollisionSolver:
         """Number of iterations of the last refinement: the largest of all components, summed over the passes."""
         return self._progress.iterations
 
-    def summary(self) -> torch.Tensor:
+    def summary(self, before: torch.Tensor | None = None) -> torch.Tensor:
         """Report of the last refinement: iterations, number of components stopped by the limit, their largest error.
 
-        float64 [3] on the solver's device, the error in metres; does not wait for the solve.
+        float64 [3] on the solver's device, the error in metres; does not wait for the solve. An earlier summary
+        `before` is added to it.
         """
-        return self._progress.summary()
+        return self._progress.summary(before)
 
     def warn_if_stopped(self, stopped: float, error: float) -> None:
         """Warns, once, if components were stopped by the limit.

@@ -1,5 +1,7 @@
 """The deformation gradients of a garment in the next frame: steps 2 and 3 of Algorithm 1, in two launches.
 
+`keep_finite` then chooses, in another one, between new positions and old ones.
+
 Manifold-aware transformers, Algorithm 1: "Φ ← Ψ Φ, replace singular values of Φ with Σ" (svd.py).
 
     | paper | code            | what                                                        |
@@ -44,6 +46,32 @@ def broken_garments_kernel(
     q = velocity[component_of_face[i]]
     if not (wp.isfinite(psi[i]) and wp.isfinite(singular_values[i]) and wp.isfinite(q)):
         broken[garment_of_face[i]] = 1
+
+
+@wp.kernel(enable_backward=False)
+def keep_finite_kernel(
+    from_row: wp.int32,
+    # Model:
+    start: wp.array[wp.int32],
+    # In:
+    later: wp.array[wp.vec3],
+    earlier: wp.array[wp.vec3],
+    before: wp.array[wp.uint8],
+    # Out:
+    kept: wp.array[wp.vec3],
+    finite: wp.array[wp.uint8],
+):
+    b = from_row + wp.tid()
+    sound = before[b]
+    for i in range(start[b], start[b + 1]):
+        point = later[i]
+        kept[i] = point
+        if not wp.isfinite(point):
+            sound = wp.uint8(0)
+    finite[b] = sound
+    if sound == wp.uint8(0):
+        for i in range(start[b], start[b + 1]):
+            kept[i] = earlier[i]
 
 
 @wp.kernel(enable_backward=False)
@@ -148,3 +176,38 @@ def next_gradients(
                 device=warp_device,
             )
     return target, broken == 0
+
+
+def keep_finite(
+    start: torch.Tensor, new: torch.Tensor, old: torch.Tensor, finite: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """New positions of garments all of whose new positions are finite, old ones of the others, on a CPU; without
+    gradients.
+
+    Args:
+        start: First vertex of each garment, and the number of all, int32 [B+1].
+        new: Positions [m], float32 [V,3].
+        old: Positions to keep where new ones are not finite [m], float32 [V,3].
+        finite: Which garments are still simulated, bool [B]; the others keep their old positions, too.
+
+    Returns:
+        Positions [m], float32 [V,3], and which garments are finite, bool [B].
+
+    Raises:
+        TypeError, ValueError: An argument has another dtype or shape, or is on another device.
+    """
+    count, device = len(start) - 1, new.device
+    expect("new", new, (None, 3))
+    expect("old", old, tuple(new.shape), device=device)
+    expect("finite", finite, (count,), torch.bool, device)
+    kept, still = allocate(new.shape, torch.float32, device), allocate((count,), torch.bool, device)
+    given = [
+        as_argument(start, wp.int32),
+        as_argument(new.detach(), wp.vec3),
+        as_argument(old.detach(), wp.vec3),
+        as_argument(finite.view(torch.uint8), wp.uint8),
+    ]
+    written = [as_argument(kept, wp.vec3), as_argument(still.view(torch.uint8), wp.uint8)]
+    with torch_stream(device) as warp_device:
+        launch_rows(keep_finite_kernel, count, given, written, warp_device, least=16)
+    return kept, still

@@ -23,6 +23,7 @@ import warp as wp
 from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
+from warpgarment.kernels.replay import addresses
 
 from .face_blocks import embed_block, first_block, head_block, hear_block, spread_block
 from .products import BLOCK, argument
@@ -200,7 +201,7 @@ def embed(
     pitch, channels = frames[-1].stride(0), frames[-1].shape[1]
     if any(frame.stride() != (pitch, 1) for frame in frames):
         frames, pitch = [frame.contiguous() for frame in frames], channels
-    places = torch.tensor([frame.data_ptr() for frame in frames])
+    places = addresses(frames)
     result = allocate((*index.shape, len(bias)), torch.float32, index.device)
     sizes = [channels, pitch, len(bias), len(weight)]
     given = [argument(values) for values in (centre, weight, bias, index, places)]

@@ -4,8 +4,37 @@ from __future__ import annotations
 
 import warnings
 
-import numpy as np
 import torch
+import warp as wp
+
+from warpgarment.kernels import compiling
+from warpgarment.kernels.launch import as_argument, launch, torch_stream
+from warpgarment.kernels.operator import allocate
+from warpgarment.kernels.replay import recording
+
+wp.set_module_options(compiling.options())
+
+
+@wp.kernel(enable_backward=False)
+def summary_kernel(
+    # In:
+    report: wp.array[wp.int32],
+    error: wp.array[wp.float64],
+    before: wp.array[wp.float64],
+    # Out:
+    summary: wp.array[wp.float64],
+):
+    iterations = wp.int32(0)
+    stopped = wp.int32(0)
+    largest = wp.float64(0.0)
+    for c in range(report.shape[0]):
+        iterations = wp.max(iterations, wp.abs(report[c]))
+        if report[c] < 0:
+            stopped += 1
+            largest = wp.max(largest, error[c])
+    summary[0] = before[0] + wp.float64(iterations)
+    summary[1] = before[1] + wp.float64(stopped)
+    summary[2] = wp.max(before[2], largest)
 
 
 class Progress:
@@ -32,7 +61,7 @@ class Progress:
         """
         self._solves = [*(self._solves if add else []), (report, error)]
         self._limit = limit
-        if report.device.type == "cpu":
+        if report.device.type == "cpu" and not recording():
             self._warn(report, error)
 
     @property
@@ -42,33 +71,34 @@ class Progress:
             self._warn(*solve)
         return sum(int(report.abs().max()) for report, _ in self._solves if len(report))
 
-    def summary(self) -> torch.Tensor:
+    def summary(self, before: torch.Tensor | None = None) -> torch.Tensor:
         """`iterations`, number of components stopped by the limit, their largest error [m]; float64 [3] on the device.
 
         Does not wait for the solve. Once the numbers have been read from the device, pass them to `warn_if_stopped`.
+
+        Args:
+            before: Another summary, float64 [3], to which this one is added; None: there is none.
         """
         if self._solves[0][0].device.type == "cpu":
-            return self._on_host()
+            return self._on_host(before)
         reports, errors = (torch.stack(tensors) for tensors in zip(*self._solves, strict=True))
         if not reports.shape[1]:
-            return errors.new_zeros(3)
+            return errors.new_zeros(3) if before is None else before
         stopped = reports < 0
         iterations = reports.abs().amax(1).sum()
-        return torch.stack([iterations.double(), stopped.sum().double(), torch.where(stopped, errors, 0.0).max()])
+        found = torch.stack([iterations.double(), stopped.sum().double(), torch.where(stopped, errors, 0.0).max()])
+        return found if before is None else torch.cat([before[:2] + found[:2], torch.maximum(before[2:], found[2:])])
 
-    def _on_host(self) -> torch.Tensor:
+    def _on_host(self, before: torch.Tensor | None) -> torch.Tensor:
         """The same where reports are on the host."""
-        iterations = stopped = 0
-        largest = 0.0
+        total = torch.zeros(3, dtype=torch.float64) if before is None else before
         for report, error in self._solves:
-            counts = report.numpy()
-            if len(counts):
-                iterations += int(np.abs(counts).max())
-                ended = counts < 0
-                if ended.any():
-                    stopped += int(ended.sum())
-                    largest = max(largest, float(error.detach().numpy()[ended].max()))
-        return torch.tensor([iterations, stopped, largest], dtype=torch.float64)
+            later = allocate((3,), torch.float64, report.device)
+            given = as_argument(report, wp.int32), as_argument(error.detach(), wp.float64)
+            with torch_stream(report.device) as device:
+                launch(summary_kernel, 1, [*given, as_argument(total, wp.float64), as_argument(later, wp.float64)], device)
+            total = later
+        return total
 
     def warn_if_stopped(self, stopped: float, components: int, error: float) -> None:
         """Warns, once, if components were stopped by the limit.

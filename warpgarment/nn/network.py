@@ -181,6 +181,15 @@ class GarmentNetwork(nn.Module):
         moved = context(newest, layout.face_component, components)
         return compose(output, moved, residual=self.config.residual)
 
+    def replayed(self, layout: Any) -> object | None:
+        """What launches of `predict` are made from, if they are all that it does on this device, so that they can be
+        recorded and replayed: another object once weights have changed. None, as here, if they cannot.
+
+        Args:
+            layout: The result of `layout`.
+        """
+        return None
+
     def packed_inputs(
         self, inputs: FrameInputs, layout: RowLayout
     ) -> tuple[torch.Tensor | Frames, torch.Tensor, torch.Tensor, torch.Tensor | None]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -70,6 +71,16 @@ class PackedGarments:
     def count(self) -> int:
         """Number of garments B."""
         return len(self.vertex_offsets) - 1
+
+    @cached_property
+    def vertex_start(self) -> torch.Tensor:
+        """`vertex_offsets` on the device, int32 [B+1]."""
+        return torch.tensor(self.vertex_offsets, dtype=torch.int32, device=self.faces.device)
+
+    @cached_property
+    def owner(self) -> torch.Tensor:
+        """`garment_of_vertex` as an index, int64 [V]."""
+        return self.garment_of_vertex.long()
 
     @property
     def component_count(self) -> int:

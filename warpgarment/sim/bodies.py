@@ -23,6 +23,11 @@ class MovingBodies:
         self._meshes = BodyMeshes(vertices, packed.faces, packed.vertex_offsets, packed.face_offsets)
         self.placed: torch.Tensor | None = vertices
 
+    @property
+    def moved(self) -> BodyMeshes:
+        """The meshes where the last update left them."""
+        return self._meshes
+
     def at(self, vertices: torch.Tensor) -> BodyMeshes:
         """The meshes of the bodies at these positions [m], shape [U,3]."""
         if self.placed is not vertices:

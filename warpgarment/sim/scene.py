@@ -21,6 +21,7 @@ from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
 from warpgarment.kernels.features.skin import Skin, bind
+from warpgarment.kernels.replay import Pieces
 from warpgarment.kernels.threads import torch_on_all
 from warpgarment.nn.architecture import architecture
 from warpgarment.nn.inputs import FrameInputs, Frames, VertexStep
@@ -72,6 +73,7 @@ class Scene:
         layers: Garments of each outfit, innermost first, as numbers in the batch; see `arguments.outfits`.
         materials: Material of each garment, with the fields of `Material`, shape [B,M]; NaN for a garment without one.
             None if no garment has one.
+        replay: Whether what is the same in every frame is recorded, and then replayed.
 
     Attributes:
         contact_sources: List of contact sources; more may be appended before the first frame.
@@ -102,6 +104,7 @@ class Scene:
         brought: Brought | None = None,
         layers: Sequence[Sequence[int]] = (),
         materials: torch.Tensor | None = None,
+        replay: bool = False,
     ) -> None:
         if missing := network.reads - GIVEN:
             raise ValueError(f"the network reads {', '.join(sorted(missing))}, which simulations do not give yet")
@@ -170,6 +173,7 @@ class Scene:
 
             self.meet = Meet(packed, layers, first_vertices, self.contact, timings)
         self.correct = Correct(self.correctors, packed, self.contact.depth, timings)
+        self.pieces = self.contact.pieces = Pieces(on=replay)
 
     def begin(self, body_vertices: torch.Tensor, first_vertices: torch.Tensor) -> None:
         """Places the bodies anew, and ties pins to them; states and gradients of the scene so far are no longer usable.
@@ -181,6 +185,7 @@ class Scene:
         if self.skin is not None:
             raise ValueError("a scene of a network that reads the skin begins once")
         self.reconstruct.hold(first_vertices, self.bodies.at(body_vertices))
+        self.pieces.clear()
 
     def _refuse_far(self, vertices: torch.Tensor, body_of_vertex: torch.Tensor) -> None:
         """Raises MeshError for a garment whose vertices are all more than `FARTHEST` from its body."""
@@ -229,6 +234,12 @@ class Scene:
             bodies=self.packed_bodies,
             skin=self.skin,
         )
+
+    def replayed(self) -> object | None:
+        """What a recording of the network's launches depends on, see `GarmentNetwork.replayed`."""
+        if not self.pieces.on or self.half or torch.is_grad_enabled():
+            return None
+        return self.network.replayed(self.layout)
 
     def predict(self, inputs: FrameInputs) -> Step | VertexStep:
         """Step 2 of a frame: the network predicts the step to t+1."""

@@ -80,9 +80,7 @@ class Simulator:
         self.device = device_of(device)
         if (epsilon is not None and not epsilon >= 0.0) or collision_passes < 0:
             raise ValueError(f"epsilon and collision_passes must not be negative, got {epsilon} and {collision_passes}")
-        if graph and self.device.type != "cuda":
-            raise ValueError(f"graph=True needs a CUDA device, this is {self.device}; leave it out")
-        self.graph = self.device.type == "cuda" if graph is None else graph
+        self.graph = graph is None or graph
         self.network = network.to(self.device)
         self.epsilon, self.collision_passes, self.half = epsilon, int(collision_passes), half
         self.timings = Timings(self.device)
@@ -386,9 +384,11 @@ class Simulator:
             brought=brought,
             layers=layers,
             materials=materials,
+            replay=self.graph and self.device.type == "cpu",
         )
         warn_of_wrong_order(scene, known[0], body_frames[0], layers)
-        return starting_states(scene, single, known, body_frames, wind, GraphedFrames(scene) if self.graph else None)
+        graphed = GraphedFrames(scene) if self.graph and self.device.type == "cuda" else None
+        return starting_states(scene, single, known, body_frames, wind, graphed)
 
     @torch.inference_mode()
     def _advance(

@@ -7,6 +7,8 @@ import time
 
 import torch
 
+from warpgarment.kernels.replay import marked, recording
+
 
 class Timings(dict[str, float]):
     """Total seconds of each stage; a call with the name of a stage is a context manager that measures a block.
@@ -24,7 +26,8 @@ class Timings(dict[str, float]):
         """A block whose time is added to the stage."""
         if self.device.type == "cuda" and not self.synchronise:
             return contextlib.nullcontext()
-        return _Block(self, stage)
+        block = _Block(self, stage)
+        return marked(block.__enter__, block.__exit__) if recording() else block
 
 
 class _Block:

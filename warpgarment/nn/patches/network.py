@@ -153,6 +153,11 @@ class PatchTransformer(GarmentNetwork):
             return fused.predict(self, inputs, layout)
         return super().predict(inputs, layout, bfloat16=bfloat16)
 
+    def replayed(self, layout: RowLayout) -> object | None:
+        """As in `GarmentNetwork`, where `predict` is kernels."""
+        fits = self.takes_frames and layout.face_component.device.type == "cpu" and fused.predicts(self, layout)
+        return fused.packed(self) if fits else None
+
     def embedded(
         self, face_features: torch.Tensor, turn: torch.Tensor | None, face_mask: torch.Tensor | None
     ) -> torch.Tensor:

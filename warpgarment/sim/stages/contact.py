@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 
@@ -14,7 +15,9 @@ from warpgarment.kernels.collision.contact_set import (
     one_for_each_vertex,
 )
 from warpgarment.kernels.collision.solver import CollisionSolver
+from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.features.carry import carried, face_at_each_vertex
+from warpgarment.kernels.replay import Pieces, recording
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.surface_depth import SurfaceDepth
 from warpgarment.objects.pack import PackedGarments
@@ -29,6 +32,32 @@ STRAIGHT = 2
 """How often, at the end, vertices that are still inside are placed outside without their neighbours."""
 CLEAR = 5e-4
 """Distance from the surface at which they are placed [m]."""
+
+
+class Pass(NamedTuple):
+    """A batch between two passes."""
+
+    vertices: torch.Tensor  # [V,3] [m]
+    finite: torch.Tensor  # bool [B]
+    pending: torch.Tensor  # bool [B], garments that the next pass moves
+    on_body: torch.Tensor  # int32 [V], body of each vertex in the last pass; -1 for none
+    epsilon: torch.Tensor  # [V], distance that vertices kept in it [m]
+    report: torch.Tensor | None = None  # float64 [3] of the solves; None before the first
+    depth: torch.Tensor | None = None  # [B] of the garments [m]; with what follows None before it is measured
+    at: torch.Tensor | None = None  # [V,3], positions at which it was measured last [m]
+    missing: torch.Tensor | None = None  # [V], see `SurfaceDepth`
+    inside: torch.Tensor | None = None  # [V], depth of each vertex there
+    clear: torch.Tensor | None = None  # [V], ball around each vertex without surface
+
+    @property
+    def measured(self) -> tuple[torch.Tensor, SurfaceDepth] | None:
+        """Where depths were measured last, and what was found."""
+        if self.at is None or self.depth is None or self.missing is None or self.inside is None or self.clear is None:
+            return None
+        return self.at, SurfaceDepth(self.depth, self.missing, self.inside, self.clear)
+
+
+FIELDS = len(Pass._fields)
 
 
 class Contact:
@@ -51,6 +80,7 @@ class Contact:
         early_exit: Whether the host checks after each pass if another one is needed. On a GPU it does not: a pass takes
             less time than waiting for that result.
         solver: Solver of the refinement; None without passes.
+        pieces: Runs the parts of a pass.
     """
 
     def __init__(
@@ -70,6 +100,7 @@ class Contact:
         self._face_of_vertex = face_at_each_vertex(packed.faces, len(packed.rest_vertices))
         self.early_exit = packed.faces.device.type == "cpu"
         self.solver = CollisionSolver(packed.rest_vertices, packed.faces) if passes else None
+        self.pieces = Pieces()
 
     def origin(self, vertices: torch.Tensor, features: torch.Tensor) -> torch.Tensor | None:
         """Positions at t+1 of vertices that would move with the body; see `carried`.
@@ -110,37 +141,77 @@ class Contact:
             garments that are not finite; and the solver's report on all passes, float64 [3]: iterations, number of
             components stopped by the limit, and their largest error.
         """
-        owner = self._packed.garment_of_vertex.long()
         with self._timings("collision"):
-            bodies, on_body, epsilon = self._bodies.at(next_body), self._body_of_vertex, self._epsilon
-            pending, depth = finite, vertices.new_zeros(self._packed.count)
-            report = vertices.new_zeros(3, dtype=torch.float64)
-            measured: tuple[torch.Tensor, SurfaceDepth] | None = None
-            for number in range(self._passes if self._sources else 0):
-                if number:
-                    inside = self._surface.depth(vertices, bodies, on_body, measured)
-                    measured = vertices, inside
-                    depth = torch.where(pending, inside.garments, depth)
-                    pending = finite & pending & (depth > SHALLOW)
-                    if self.early_exit and not pending.any():
-                        return vertices, finite, depth, report
-                    if not (self.early_exit and pending.all()):
-                        on_body = torch.where(pending[owner], self._body_of_vertex, -1)
-                    epsilon = distance_to_keep(epsilon, inside.missing, vertices, bodies, on_body)
-                assert self.solver is not None
-                frame = ContactFrame(bodies, on_body, self._packed.garment_of_vertex, epsilon, origin)
-                refined = self.solver.solve(vertices, self._contacts(vertices, frame))
-                summary = self.solver.summary()
-                report = _together(report, summary) if number else summary
-                if not (self.early_exit and pending.all()):
-                    refined = torch.where(pending[owner][:, None], refined, vertices)
-                vertices, finite = keep_finite(self._packed, refined, vertices, finite)
-            if self._sources and self._passes:
-                vertices = self._out(vertices, bodies, pending, origin)
+            state = Pass(vertices, finite, finite, self._body_of_vertex, self._epsilon)
+            passes = self._passes if self._sources else 0
+            for number in range(passes):
+                state, *found = self._run("contacts", self._find, number, state, next_body, origin)
+                if not number:
+                    self._bodies.placed = next_body
+                (state,) = self._run("refinement", self._refine, number, state, *found)
+                if number + 1 < passes:
+                    (state,) = self._run("depth", self._deepest, number, state)
+                    if self.early_exit and not state.pending.any():
+                        assert state.depth is not None and state.report is not None
+                        return state.vertices, state.finite, state.depth, state.report
+            bodies, vertices = self._bodies.at(next_body), state.vertices
+            depth = vertices.new_zeros(self._packed.count) if state.depth is None else state.depth
+            report = vertices.new_zeros(3, dtype=torch.float64) if state.report is None else state.report
+            if passes:
+                vertices = self._out(vertices, bodies, state.pending, origin)
             if measure:
-                inside = self._surface.depth(vertices, bodies, on_body, measured)
-                depth = torch.where(pending, inside.garments, depth)
-        return vertices, finite, depth, report
+                inside = self._surface.depth(vertices, bodies, state.on_body, state.measured)
+                depth = torch.where(state.pending, inside.garments, depth)
+        return vertices, state.finite, depth, report
+
+    def _run(self, name: str, part: Callable[..., tuple[Any, ...]], number: int, state: Pass, *more: Any) -> Any:
+        """Runs a part of a pass, whose first result is a `Pass`, as a piece if nothing but the body is touched."""
+        if not self.pieces.on or any(type(source) is not BodyContacts for source in self._sources):
+            return part(number, state, *more)
+
+        def flat(*tensors: Any) -> tuple[Any, ...]:
+            after, *rest = part(number, Pass(*tensors[:FIELDS]), *tensors[FIELDS:])
+            return (*after, *rest)
+
+        results = self.pieces((name, number), flat, (*state, *more))
+        return (Pass(*results[:FIELDS]), *results[FIELDS:])
+
+    def _find(self, number: int, state: Pass, next_body: torch.Tensor, origin: torch.Tensor | None) -> tuple[Any, ...]:
+        """Contacts of a pass; the first one moves the bodies."""
+        on_body, epsilon, vertices = state.on_body, state.epsilon, state.vertices
+        bodies = self._bodies.moved if number else self._bodies.at(next_body)
+        if number:
+            assert state.missing is not None
+            if not self._all(state.pending):
+                on_body = torch.where(state.pending[self._packed.owner], self._body_of_vertex, -1)
+            epsilon = distance_to_keep(epsilon, state.missing, vertices, bodies, on_body)
+        frame = ContactFrame(bodies, on_body, self._packed.garment_of_vertex, epsilon, origin)
+        found = self._contacts(vertices, frame)
+        return (state._replace(on_body=on_body, epsilon=epsilon), found.normal, found.anchor, found.distance)
+
+    def _refine(
+        self, number: int, state: Pass, normal: torch.Tensor, anchor: torch.Tensor, distance: torch.Tensor
+    ) -> tuple[Pass]:
+        """Positions after the contacts of a pass."""
+        assert self.solver is not None
+        refined = self.solver.solve(state.vertices, Contacts(normal, anchor, distance))
+        report = self.solver.summary(state.report)
+        if not self._all(state.pending):
+            refined = torch.where(state.pending[self._packed.owner][:, None], refined, state.vertices)
+        vertices, finite = keep_finite(self._packed, refined, state.vertices, state.finite)
+        return (state._replace(vertices=vertices, finite=finite, report=report),)
+
+    def _deepest(self, number: int, state: Pass) -> tuple[Pass]:
+        """Depth after a pass, and which garments need another one."""
+        inside = self._surface.depth(state.vertices, self._bodies.moved, state.on_body, state.measured)
+        depth = inside.garments if state.depth is None else torch.where(state.pending, inside.garments, state.depth)
+        pending = state.finite & state.pending & (depth > SHALLOW)
+        found = {"depth": depth, "missing": inside.missing, "inside": inside.depth, "clear": inside.clear}
+        return (state._replace(pending=pending, at=state.vertices, **found),)
+
+    def _all(self, garments: torch.Tensor) -> bool:
+        """Whether all garments are chosen, where the host may ask."""
+        return self.early_exit and not recording() and bool(garments.all())
 
     def _out(
         self, vertices: torch.Tensor, bodies: BodyMeshes, pending: torch.Tensor, origin: torch.Tensor | None
@@ -161,7 +232,7 @@ class Contact:
         """
         owner = self._packed.garment_of_vertex
         for _ in range(STRAIGHT):
-            on_body = torch.where(pending[owner.long()], self._body_of_vertex, -1)
+            on_body = torch.where(pending[self._packed.owner], self._body_of_vertex, -1)
             found = self._contacts(vertices, ContactFrame(bodies, on_body, owner, self._epsilon, origin))
             missing = (found.normal * (found.anchor - vertices)).sum(1)
             inside = missing > 0
@@ -180,8 +251,3 @@ class Contact:
         """One contact at each vertex: of those that the sources found, the one with the largest gap."""
         found = [one_for_each_vertex(s.find(vertices, frame), f"contact source {s.name!r}") for s in self._sources]
         return nearest(found, vertices)
-
-
-def _together(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Joins two reports of solves: sums of iterations and stopped components, and the largest error."""
-    return torch.cat([one[:2] + other[:2], torch.maximum(one[2:], other[2:])])
