@@ -62,6 +62,8 @@ OF_A_FRAME = (
     "deformation.gradients.rest",
     "features.carry",
     "collision.contact_set",
+    "linear.progress",
+    "team",
 )
 """Modules of `warpgarment.kernels` that a rollout of a garment launches, whatever the network; slow ones first."""
 MOST_WORKERS = 4

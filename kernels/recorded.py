@@ -28,7 +28,32 @@ if TYPE_CHECKING:
 
 MOST_BOUNDS = 4096
 
-Launch = Callable[[], object]
+
+Call = Callable[[], object]
+
+
+class Launch:
+    """A launch that is ready to run, in any thread; the memory of its arguments must live until then.
+
+    Args:
+        function: The compiled function.
+        bounds: Its bounds.
+        arguments: The structure of its arguments.
+    """
+
+    __slots__ = ("arguments", "bounds", "function")
+
+    def __init__(self, function: Any, bounds: Any, arguments: Any) -> None:
+        self.function, self.bounds, self.arguments = function, bounds, arguments
+
+    def __call__(self) -> None:
+        self.function(ctypes.byref(self.bounds), ctypes.byref(self.arguments))
+
+    @property
+    def addresses(self) -> tuple[int, int, int]:
+        """Addresses of the function, the bounds and the arguments."""
+        function = ctypes.cast(self.function, ctypes.c_void_p).value or 0
+        return function, ctypes.addressof(self.bounds), ctypes.addressof(self.arguments)
 
 
 class Record:
@@ -100,7 +125,7 @@ def noted(recording: Recording) -> Iterator[None]:
         notes.recording = None
 
 
-def note(calls: Sequence[Launch]) -> None:
+def note(calls: Sequence[Call]) -> None:
     """Gives launches that are independent of each other to what is recorded, if anything is."""
     if notes.recording is not None:
         notes.recording.launches(calls)
@@ -126,8 +151,8 @@ def launch(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp
     work()
 
 
-def prepared(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> Launch:
-    """A call that does the same once it is called, in any thread; the memory of the arguments must live until then."""
+def prepared(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: wp.Device) -> Call:
+    """A call that does the same once it is called."""
     record = _records.get(kernel)
     try:
         if record is None:
@@ -138,11 +163,10 @@ def prepared(kernel: wp.Kernel, rows: int, arguments: Sequence[object], device: 
     except TypeError:
         wp.launch(kernel, dim=rows, inputs=arguments, device=device)  # says which argument is wrong
         return lambda: None
-    forward = record.function
-    return lambda: forward(ctypes.byref(bounds), ctypes.byref(filled))
+    return Launch(record.function, bounds, filled)
 
 
-def divided(kernel: wp.Kernel, begins: Sequence[int], arguments: Sequence[object], device: wp.Device) -> list[Launch]:
+def divided(kernel: wp.Kernel, begins: Sequence[int], arguments: Sequence[object], device: wp.Device) -> list[Call]:
     """Calls for ranges of rows, as of `prepared`, of a kernel whose first parameter is the first row of a launch.
 
     Args:
@@ -163,9 +187,9 @@ def divided(kernel: wp.Kernel, begins: Sequence[int], arguments: Sequence[object
 
 def _later(record: Record, like: Any, begin: int, end: int) -> Launch:
     """The call for one range: the structure of another one with its own first row."""
-    filled, bounds, forward = record.structure.from_buffer_copy(like), record.bounds(end - begin), record.function
+    filled = record.structure.from_buffer_copy(like)
     filled.argument_0 = begin
-    return lambda: forward(ctypes.byref(bounds), ctypes.byref(filled))
+    return Launch(record.function, record.bounds(end - begin), filled)
 
 
 def adjoint(

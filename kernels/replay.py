@@ -26,6 +26,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 from . import recorded, threads
+from .team import Program
 
 Call = Callable[[], object]
 Tensors = tuple[torch.Tensor | None, ...]
@@ -77,6 +78,7 @@ class Recording(TorchFunctionMode):
     def __init__(self, frames: Sequence[torch.Tensor]) -> None:
         super().__init__()
         self.steps: list[Call] = []
+        self._phases: list[list[recorded.Launch]] = []  # launches since the last of `steps`
         self.held: list[Any] = []
         self.memory: dict[int, int] = {}  # address and bytes of what was made
         self.places: list[tuple[np.ndarray, list[tuple[int, int]]]] = []
@@ -84,8 +86,18 @@ class Recording(TorchFunctionMode):
 
     def launches(self, calls: Sequence[Call]) -> None:
         """Notes launches that are independent of each other."""
-        calls = list(calls)
-        self.steps.append(calls[0] if len(calls) == 1 else functools.partial(threads.spread, calls))
+        phase = [call for call in calls if isinstance(call, recorded.Launch)]
+        if len(phase) < len(calls):
+            raise Unrecordable("a launch whose arguments have other types than in the first one")
+        self._phases.append(phase)
+
+    def step(self, call: Call | None = None) -> None:
+        """Notes a call that follows the launches noted so far; None: nothing follows."""
+        if self._phases:
+            self.steps.append(Program(self._phases))
+            self._phases = []
+        if call is not None:
+            self.steps.append(call)
 
     def addresses(self, tensors: Sequence[torch.Tensor], places: np.ndarray) -> None:
         """Notes that `places`, int64 [H], holds the addresses of tensors, some of which may be `frames`."""
@@ -112,11 +124,11 @@ class Recording(TorchFunctionMode):
         if storages & self._storages:
             raise Unrecordable(f"{name} of a frame of the history")
         if name in CHANGES:
-            self.steps.append(functools.partial(function, *arguments, **options))
+            self.step(functools.partial(function, *arguments, **options))
         elif name in MAKES or (name in COMPUTES and not views):
             self.memory.update((_address(tensor), tensor.nbytes) for tensor in made)
             if name in COMPUTES:
-                self.steps.append(_again(name, function, arguments, options, made[0]))
+                self.step(_again(name, function, arguments, options, made[0]))
         elif name not in COMPUTES:
             raise Unrecordable(name)
 
@@ -230,6 +242,7 @@ class Pieces:
         try:
             with recorded.noted(recording), recording:
                 outputs = function(*held, *frames)
+            recording.step()
         except Unrecordable:
             piece.failed = True
             return function(*inputs, *frames)
@@ -297,11 +310,11 @@ def marked(enter: Call, leave: Call) -> Iterator[None]:
     """A block with calls before and after it, also in replays."""
     now = recorded.notes.recording
     if now is not None:
-        now.steps.append(enter)
+        now.step(enter)
     enter()
     try:
         yield
     finally:
         leave()
         if now is not None:
-            now.steps.append(leave)
+            now.step(leave)

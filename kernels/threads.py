@@ -116,6 +116,12 @@ def spread(calls: Sequence[Call]) -> None:
         raise failed[0]
 
 
+def give(call: Call, threads: int) -> None:
+    """Gives a call to a thread of the pool, which has at least that many, and does not wait for it."""
+    _start(threads)
+    _tasks.put(call)
+
+
 def _start(number: int) -> None:
     """Starts threads of the pool until there are that many."""
     if len(_started) >= number:
