@@ -15,7 +15,6 @@ from benchmarks.measure import NO_GPU, Row, aimed
 from benchmarks.networks import Named
 from warpgarment.kernels import recorded, threads
 from warpgarment.kernels.linear import progress
-from warpgarment.sim import stages
 from warpgarment.sim.advance import advance
 from warpgarment.sim.arguments import packed_on
 from warpgarment.sim.graph import WARM_UP
@@ -66,7 +65,7 @@ class FrameCounts:
             scene.meet.early_exit = False
         made = [(wp, "launch"), (wp, "launch_tiled"), (recorded, "prepared")]
         patches = [mock.patch.object(where, name, self._counted(getattr(where, name))) for where, name in made]
-        patches.append(mock.patch.object(stages.finite, "READ_ON", frozenset()))  # as on a GPU
+        patches.append(mock.patch.object(scene.pieces, "on", False))  # replays launch nothing through Python
         patches.append(mock.patch.object(threads, "count", return_value=1))  # one launch, not one for each thread
         refit = wp.Mesh.refit
 

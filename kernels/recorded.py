@@ -21,6 +21,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+import torch
 import warp as wp
 
 if TYPE_CHECKING:
@@ -109,20 +110,23 @@ class Record:
 
 class _Notes(threading.local):
     recording: Recording | None = None
+    memory: Callable[[Sequence[int], torch.dtype], torch.Tensor] | None = None
 
 
 notes = _Notes()
-"""What this thread records, see `replay.py`."""
+"""What this thread records, and where `operator.allocate` gets memory on a CPU; see `replay.py`."""
 
 
 @contextlib.contextmanager
-def noted(recording: Recording) -> Iterator[None]:
-    """Context in which the launches of this thread are given to a recording."""
-    notes.recording = recording
+def noted(
+    recording: Recording | None, memory: Callable[[Sequence[int], torch.dtype], torch.Tensor] | None
+) -> Iterator[None]:
+    """Context in which the launches of this thread are given to a recording, and memory comes from elsewhere."""
+    notes.recording, notes.memory = recording, memory
     try:
         yield
     finally:
-        notes.recording = None
+        notes.recording = notes.memory = None
 
 
 def note(calls: Sequence[Call]) -> None:

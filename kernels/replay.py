@@ -26,15 +26,16 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 from . import recorded, threads
+from .arena import Arena, Observed
 from .team import Program
 
 Call = Callable[[], object]
 Tensors = tuple[torch.Tensor | None, ...]
 
+CHECKS = 3
+"""Calls in which a replay is compared with the function."""
 WARM_UP = 2
 """Calls of a piece before it is recorded: kernels are loaded, and constants made."""
-MOST_BYTES = 2**26
-"""Memory of a recorded piece; a larger one is always called, since its memory would not be shared with others."""
 ASKS = frozenset(
     "__get__ __len__ _set_grad_enabled data_ptr device dim element_size is_contiguous is_floating_point is_inference ndimension numel size stride "
     "storage_offset untyped_storage".split()
@@ -166,7 +167,8 @@ class _Piece:
         self.recording: Recording | None = None
         self.inputs: Tensors = ()
         self.outputs: Tensors = ()
-        self.checked = False
+        self.apart: list[int] = []  # tensors that are results, as `Observed` numbers them
+        self.checks = 0
 
 
 class Pieces:
@@ -180,20 +182,17 @@ class Pieces:
         self.on = on
         self._known: dict[tuple[object, ...], _Piece] = {}
         self._own: set[int] = set()  # outputs of recorded pieces
+        self._arena = Arena()
 
     def clear(self) -> None:
         """Forgets all recordings."""
         self._known.clear()
         self._own.clear()
+        self._arena = Arena()
 
     def kept(self, tensor: torch.Tensor) -> torch.Tensor:
         """The same numbers in memory that no later frame changes."""
         return tensor.clone() if id(tensor) in self._own else tensor
-
-    def replays(self, *key: object) -> bool:
-        """Whether a piece is replayed, as far as its inputs allow."""
-        piece = self._known.get((*key, threads.count()))
-        return piece is not None and piece.checked
 
     def __call__(
         self,
@@ -217,13 +216,19 @@ class Pieces:
         """
         if not self.on or torch.is_grad_enabled():
             return function(*inputs, *frames)
-        name = (key, threads.count())
+        name = (key, threads.count(), *(tensor is None for tensor in inputs))
         piece = self._known.get(name)
         if piece is None or piece.depends is not depends:
             piece = self._known[name] = _Piece(depends)
         piece.seen += 1
-        if piece.failed or piece.seen <= WARM_UP:
+        if piece.failed or piece.seen < WARM_UP:
             return function(*inputs, *frames)
+        if piece.seen == WARM_UP:
+            seen = Observed()
+            with recorded.noted(None, seen):
+                outputs = function(*inputs, *frames)
+            piece.apart = seen.among(outputs)
+            return outputs
         if piece.recording is None:
             return self._record(piece, function, inputs, frames)
         for held, given in zip(piece.inputs, inputs, strict=True):
@@ -231,7 +236,7 @@ class Pieces:
                 assert held is not None and given is not None
                 held.copy_(given)
         _replay(piece.recording, frames)
-        return piece.outputs if piece.checked else self._check(key, piece, function, frames)
+        return piece.outputs if piece.checks == CHECKS else self._check(key, piece, function, frames)
 
     def _record(
         self, piece: _Piece, function: Callable[..., Tensors], inputs: Tensors, frames: Sequence[torch.Tensor]
@@ -240,15 +245,12 @@ class Pieces:
         held = tuple(t if t is None or id(t) in self._own else t.clone() for t in inputs)
         recording = Recording(frames)
         try:
-            with recorded.noted(recording), recording:
+            with recorded.noted(recording, self._arena.given_out(piece.apart)), recording:
                 outputs = function(*held, *frames)
             recording.step()
         except Unrecordable:
             piece.failed = True
             return function(*inputs, *frames)
-        if sum(recording.memory.values()) > MOST_BYTES:
-            piece.failed = True
-            return outputs
         piece.recording, piece.inputs, piece.outputs = recording, held, outputs
         mine = {id(t) for t, given in zip(held, inputs, strict=True) if t is not given} | self._own
         self._own.update(id(t) for t in outputs if t is not None and (id(t) in mine or _address(t) in recording.memory))
@@ -265,7 +267,7 @@ class Pieces:
             for a, b in zip(wrote, wanted, strict=True)
         )
         if same:
-            piece.checked = True
+            piece.checks += 1
         else:
             piece.failed, piece.recording = True, None
             warnings.warn(
@@ -298,6 +300,13 @@ def addresses(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
     if now is not None:
         now.addresses(tensors, places)
     return torch.from_numpy(places)
+
+
+def also(call: Call) -> None:
+    """Calls something that is neither a launch nor an operator of torch, also in replays."""
+    if recorded.notes.recording is not None:
+        recorded.notes.recording.step(call)
+    call()
 
 
 def recording() -> bool:

@@ -40,6 +40,8 @@ _WALK = """
         static void pause(number* board, number looks) {
 #if defined(__x86_64__)
             __builtin_ia32_pause();
+#elif defined(__aarch64__)
+            __builtin_arm_yield();
 #endif
             if (looks % 4096 == 0 && board[YIELD]) ((yield_function)board[YIELD])();
         }

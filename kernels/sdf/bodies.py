@@ -19,6 +19,7 @@ import warp as wp
 from warpgarment.kernels import kept
 from warpgarment.kernels.launch import as_warp, expect, launch, torch_stream
 from warpgarment.kernels.mesh.caps import caps_of, joined
+from warpgarment.kernels.replay import also
 
 from . import inside, nearest_face
 from .closest import Bodies, query_bodies
@@ -161,7 +162,7 @@ class BodyMeshes:
         self._vertices.copy_(vertices.detach())
         with torch_stream(self.device):
             for mesh in self._meshes:
-                mesh.refit()
+                also(mesh.refit)
         if self._trees:
             self._trees.refit()
         self._measure_loops()

@@ -28,7 +28,8 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     before, kept = now.positions, scene.pieces.kept
     stacked, features, solved, finite, origin, solve = _begun(scene, now, next_body)
     solved = scene.relax(solved, finite)
-    pushed, finite, depth, report = scene.contact(solved, next_body, finite, origin, measure=scene.meet is None)
+    *moved, report = scene.contact(solved, next_body, finite, origin, measure=scene.meet is None)
+    pushed, finite, depth = map(kept, moved)
     meeting = now.meeting
     if scene.meet is not None:
         pushed, meeting, deep = scene.meet(before, pushed, features, next_body, finite, origin)
@@ -37,12 +38,12 @@ def advance(scene: Scene, now: Frame, next_body: torch.Tensor) -> Frame:
     end = before, after, now.velocities, solve, report
     velocities, solves = scene.pieces("end", functools.partial(_end, scene), end)
     return Frame(
-        kept(after),
+        after,
         next_body,
         Frames(stacked.frames[1:]) if isinstance(stacked, Frames) else stacked[:, 1:],
         kept(velocities),
-        kept(finite),
-        kept(depth),
+        finite,
+        depth,
         kept(solves),
         meeting,
         earlier(now.previous, before),

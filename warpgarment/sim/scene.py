@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from warpgarment.sim.stages.meet import Meet
 
 GIVEN = frozenset({"previous", "materials", "wind", "skin"})  # optional inputs of networks that simulations have
+MOST_REPLAYED = 32_768
+"""Faces of a batch up to which frames are replayed: of larger ones kernels take the time, and the memory counts."""
 FARTHEST = 1.0  # metres; a garment whose nearest vertex is farther from its body has a wrong position or unit
 
 
@@ -173,7 +175,7 @@ class Scene:
 
             self.meet = Meet(packed, layers, first_vertices, self.contact, timings)
         self.correct = Correct(self.correctors, packed, self.contact.depth, timings)
-        self.pieces = self.contact.pieces = Pieces(on=replay)
+        self.pieces = self.contact.pieces = Pieces(on=replay and len(packed.faces) <= MOST_REPLAYED)
 
     def begin(self, body_vertices: torch.Tensor, first_vertices: torch.Tensor) -> None:
         """Places the bodies anew, and ties pins to them; states and gradients of the scene so far are no longer usable.

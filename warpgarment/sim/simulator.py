@@ -55,8 +55,10 @@ class Simulator:
         collision_passes: Largest number of collision refinements per frame. They are repeated while any point of a
             garment is more than 0.1 mm deep; 0 leaves them out.
         half: Whether the transformer runs in bfloat16, which is faster on recent GPUs. Geometry stays in float32.
-        graph: Whether frames after the first few are replayed as one CUDA graph (`graph.py`). None does so on CUDA. A
-            graph that cannot be made is a RuntimeWarning. Frames are not replayed while `timings.synchronise` is set.
+        graph: Whether what is the same in every frame is recorded in the first few and then replayed: all of it as one
+            CUDA graph (`graph.py`), or on a CPU the launches of kernels between decisions (`kernels/replay.py`). None
+            does. A CUDA graph that cannot be made is a RuntimeWarning, and none is replayed while `timings.synchronise`
+            is set.
 
     Attributes:
         timings: Seconds per stage since the simulator was made, a dict. On CUDA, times are measured only while its
@@ -80,7 +82,8 @@ class Simulator:
         self.device = device_of(device)
         if (epsilon is not None and not epsilon >= 0.0) or collision_passes < 0:
             raise ValueError(f"epsilon and collision_passes must not be negative, got {epsilon} and {collision_passes}")
-        self.graph = graph is None or graph
+        replayed = graph is None or graph
+        self.graph, self.replay = replayed and self.device.type == "cuda", replayed and self.device.type == "cpu"
         self.network = network.to(self.device)
         self.epsilon, self.collision_passes, self.half = epsilon, int(collision_passes), half
         self.timings = Timings(self.device)
@@ -384,11 +387,10 @@ class Simulator:
             brought=brought,
             layers=layers,
             materials=materials,
-            replay=self.graph and self.device.type == "cpu",
+            replay=self.replay and not self.graph,
         )
         warn_of_wrong_order(scene, known[0], body_frames[0], layers)
-        graphed = GraphedFrames(scene) if self.graph and self.device.type == "cuda" else None
-        return starting_states(scene, single, known, body_frames, wind, graphed)
+        return starting_states(scene, single, known, body_frames, wind, GraphedFrames(scene) if self.graph else None)
 
     @torch.inference_mode()
     def _advance(

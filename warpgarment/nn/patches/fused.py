@@ -20,6 +20,7 @@ from warpgarment.kernels.dense import heading as heads
 from warpgarment.kernels.dense import products, tokens
 from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT, Kind, Layout
+from warpgarment.kernels.operator import allocate
 from warpgarment.nn.inputs import Frames
 from warpgarment.nn.parametrisation import Step
 
@@ -232,7 +233,7 @@ def predict(network: PatchTransformer, inputs: FrameInputs, layout: RowLayout) -
     columns = (LAYOUT[name].start for name in ("deformation_gradient", "body_velocity", "body_deformation"))
     gradient, body_velocity, body = columns
     shapes = (len(newest), 3, 3), (len(newest), 3), (len(velocities), 3)
-    step = Step(*(newest.new_empty(shape) for shape in shapes))
+    step = Step(*(allocate(shape, newest.dtype, newest.device) for shape in shapes))
     for view in layout.views:
         rows = heads.Rows(view.index, view.piece, layout.face_component)
         found = heads.heading(newest, velocities, rows, weights.heading, gradient, body_velocity)
@@ -278,10 +279,10 @@ def forward(
     layers = weights.alone if layout.neighbours is None else weights.after
     if not layers:
         return dense.head(own, weights.head), velocity
-    room = torch.empty_like(own)
+    room = allocate(own.shape, own.dtype, own.device)
     for layer in layers[:-1]:
         dense.hear(faces, own, layout.neighbours, layer, room)
         own, room = room, own
-    answer = own.new_empty((*own.shape[:2], len(weights.head.bias)))
+    answer = allocate((*own.shape[:2], len(weights.head.bias)), own.dtype, own.device)
     dense.hear(faces, own, layout.neighbours, layers[-1], answer, weights.head)
     return answer, velocity

@@ -141,6 +141,8 @@ class Contact:
             garments that are not finite; and the solver's report on all passes, float64 [3]: iterations, number of
             components stopped by the limit, and their largest error.
         """
+        if self.pieces.on and not self._replays:
+            vertices, origin = self.pieces.kept(vertices), None if origin is None else self.pieces.kept(origin)
         with self._timings("collision"):
             state = Pass(vertices, finite, finite, self._body_of_vertex, self._epsilon)
             passes = self._passes if self._sources else 0
@@ -164,9 +166,14 @@ class Contact:
                 depth = torch.where(state.pending, inside.garments, depth)
         return vertices, state.finite, depth, report
 
+    @property
+    def _replays(self) -> bool:
+        """Whether parts of a pass are pieces: other sources than the body may do anything, and keep what they get."""
+        return self.pieces.on and all(type(source) is BodyContacts for source in self._sources)
+
     def _run(self, name: str, part: Callable[..., tuple[Any, ...]], number: int, state: Pass, *more: Any) -> Any:
-        """Runs a part of a pass, whose first result is a `Pass`, as a piece if nothing but the body is touched."""
-        if not self.pieces.on or any(type(source) is not BodyContacts for source in self._sources):
+        """Runs a part of a pass, whose first result is a `Pass`."""
+        if not self._replays:
             return part(number, state, *more)
 
         def flat(*tensors: Any) -> tuple[Any, ...]:
