@@ -63,7 +63,7 @@ OF_A_FRAME = (
     "features.carry",
     "collision.contact_set",
     "linear.progress",
-    "team",
+    "replay.team",
 )
 """Modules of `warpgarment.kernels` that a rollout of a garment launches, whatever the network; slow ones first."""
 MOST_WORKERS = 4

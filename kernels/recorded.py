@@ -25,7 +25,7 @@ import torch
 import warp as wp
 
 if TYPE_CHECKING:
-    from .replay import Recording
+    from .replay.recording import Recording
 
 MOST_BOUNDS = 4096
 
@@ -114,7 +114,7 @@ class _Notes(threading.local):
 
 
 notes = _Notes()
-"""What this thread records, and where `operator.allocate` gets memory on a CPU; see `replay.py`."""
+"""What this thread records, and where `operator.allocate` gets memory on a CPU; see `replay`."""
 
 
 @contextlib.contextmanager

@@ -23,7 +23,7 @@ import warp as wp
 from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
-from warpgarment.kernels.replay import addresses
+from warpgarment.kernels.replay.recording import addresses
 
 from .face_blocks import embed_block, first_block, head_block, hear_block, spread_block
 from .products import BLOCK, argument

@@ -10,7 +10,7 @@ import warp as wp
 from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch, torch_stream
 from warpgarment.kernels.operator import allocate
-from warpgarment.kernels.replay import recording
+from warpgarment.kernels.replay.recording import recording
 
 wp.set_module_options(compiling.options())
 
@@ -96,7 +96,9 @@ class Progress:
             later = allocate((3,), torch.float64, report.device)
             given = as_argument(report, wp.int32), as_argument(error.detach(), wp.float64)
             with torch_stream(report.device) as device:
-                launch(summary_kernel, 1, [*given, as_argument(total, wp.float64), as_argument(later, wp.float64)], device)
+                launch(
+                    summary_kernel, 1, [*given, as_argument(total, wp.float64), as_argument(later, wp.float64)], device
+                )
             total = later
         return total
 

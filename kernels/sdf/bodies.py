@@ -19,7 +19,7 @@ import warp as wp
 from warpgarment.kernels import kept
 from warpgarment.kernels.launch import as_warp, expect, launch, torch_stream
 from warpgarment.kernels.mesh.caps import caps_of, joined
-from warpgarment.kernels.replay import also
+from warpgarment.kernels.replay.recording import also
 
 from . import inside, nearest_face
 from .closest import Bodies, query_bodies

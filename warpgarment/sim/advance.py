@@ -1,6 +1,6 @@
 """One frame of a batch to the next one (Algorithm 1).
 
-A CPU replays what does the same in every frame (`kernels/replay.py`): `_begin`, for networks that allow it, parts of
+A CPU replays what does the same in every frame (`kernels/replay`): `_begin`, for networks that allow it, parts of
 the passes of contact (`stages/contact.py`), and `_end`. Between them the host looks if anything is deep in a body.
 """
 
@@ -67,7 +67,7 @@ def _begun(scene: Scene, now: Frame, next_body: torch.Tensor) -> tuple[Any, ...]
     return (Frames((*past.frames, features)), features, *more)
 
 
-def _begin(scene: Scene, like: Frame, *moving: Any) -> tuple[torch.Tensor, ...]:
+def _begin(scene: Scene, like: Frame, *moving: Any) -> tuple[Any, ...]:
     """Features of frame t and the results of `_step`.
 
     Args:

@@ -21,7 +21,7 @@ from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import ContactSource
 from warpgarment.kernels.deformation.gradients import inverse_rest_frames
 from warpgarment.kernels.features.skin import Skin, bind
-from warpgarment.kernels.replay import Pieces
+from warpgarment.kernels.replay.pieces import Pieces
 from warpgarment.kernels.threads import torch_on_all
 from warpgarment.nn.architecture import architecture
 from warpgarment.nn.inputs import FrameInputs, Frames, VertexStep

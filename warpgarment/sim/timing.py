@@ -7,7 +7,7 @@ import time
 
 import torch
 
-from warpgarment.kernels.replay import marked, recording
+from warpgarment.kernels.replay.recording import marked, recording
 
 
 class Timings(dict[str, float]):

@@ -21,6 +21,7 @@ from warpgarment.kernels.dense import products, tokens
 from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT, Kind, Layout
 from warpgarment.kernels.operator import allocate
+from warpgarment.kernels.replay.recording import passing
 from warpgarment.nn.inputs import Frames
 from warpgarment.nn.parametrisation import Step
 
@@ -235,19 +236,22 @@ def predict(network: PatchTransformer, inputs: FrameInputs, layout: RowLayout) -
     shapes = (len(newest), 3, 3), (len(newest), 3), (len(velocities), 3)
     step = Step(*(allocate(shape, newest.dtype, newest.device) for shape in shapes))
     for view in layout.views:
-        rows = heads.Rows(view.index, view.piece, layout.face_component)
-        found = heads.heading(newest, velocities, rows, weights.heading, gradient, body_velocity)
-        faces = dense.embed(read, rows.face, *turned(weights.embed, network.feature_mean, found.turns), weights.bias)
-        if network.outdoor.width:
-            outdoor = None if outside is None else network.known(view.faces(outside))
-            if outdoor is not None:
-                outdoor = outdoor @ network.outdoor.turn(found.turn).mT
-            faces = network.with_outdoor(faces, outdoor, None, embedded=True)
-        mask = network.key_mask(view.weights, view.component_mask, found.tokens)
-        answer, velocity = forward(weights, faces, found.tokens, view.weights, mask)
-        written = step.psi, step.singular_values
-        steps(answer, weights.step_scale, found.turn, rows.face, newest, body, written, residual=residual)
-        heads.velocities(velocity, found, rows, weights.velocity_scale, step.velocity, residual=residual)
+        with passing():
+            rows = heads.Rows(view.index, view.piece, layout.face_component)
+            found = heads.heading(newest, velocities, rows, weights.heading, gradient, body_velocity)
+            faces = dense.embed(
+                read, rows.face, *turned(weights.embed, network.feature_mean, found.turns), weights.bias
+            )
+            if network.outdoor.width:
+                outdoor = None if outside is None else network.known(view.faces(outside))
+                if outdoor is not None:
+                    outdoor = outdoor @ network.outdoor.turn(found.turn).mT
+                faces = network.with_outdoor(faces, outdoor, None, embedded=True)
+            mask = network.key_mask(view.weights, view.component_mask, found.tokens)
+            answer, velocity = forward(weights, faces, found.tokens, view.weights, mask)
+            written = step.psi, step.singular_values
+            steps(answer, weights.step_scale, found.turn, rows.face, newest, body, written, residual=residual)
+            heads.velocities(velocity, found, rows, weights.velocity_scale, step.velocity, residual=residual)
     return step
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.collision.contact_set import (
     ContactFrame,
     Contacts,
@@ -15,9 +16,9 @@ from warpgarment.kernels.collision.contact_set import (
     one_for_each_vertex,
 )
 from warpgarment.kernels.collision.solver import CollisionSolver
-from warpgarment.kernels.collision.body_contacts import BodyContacts
 from warpgarment.kernels.features.carry import carried, face_at_each_vertex
-from warpgarment.kernels.replay import Pieces, recording
+from warpgarment.kernels.replay.pieces import Pieces
+from warpgarment.kernels.replay.recording import recording
 from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.kernels.sdf.surface_depth import SurfaceDepth
 from warpgarment.objects.pack import PackedGarments
@@ -154,7 +155,8 @@ class Contact:
                 if number + 1 < passes:
                     (state,) = self._run("depth", self._deepest, number, state)
                     if self.early_exit and not state.pending.any():
-                        assert state.depth is not None and state.report is not None
+                        assert state.depth is not None
+                        assert state.report is not None
                         return state.vertices, state.finite, state.depth, state.report
             bodies, vertices = self._bodies.at(next_body), state.vertices
             depth = vertices.new_zeros(self._packed.count) if state.depth is None else state.depth

@@ -1,8 +1,8 @@
 """Runs recorded launches one after another without Python, on several threads that meet between them.
 
 A program is a list of phases, each of which is one launch or several ranges of rows of one. All threads go through all
-phases: a thread takes ranges of a phase until none is left, and goes on when all of them are done. So it does not matter
-how many threads there are, nor when one of them comes; a thread that comes late passes phases that are done.
+phases: a thread takes ranges of a phase until none is left, and goes on when all of them are done. So it does not
+matter how many threads there are, nor when one of them comes; one that comes late passes phases that are done.
 
     board      the program that runs now, how many threads are inside, and whether each helper is awake
     counters   of each phase: how many ranges were taken, and how many are done
@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from . import compiling, recorded, threads
+from warpgarment.kernels import compiling, recorded, threads
 
 wp.set_module_options(compiling.options())
 
@@ -156,9 +156,9 @@ _MOST_HELPERS = 255
 _board = np.zeros(HELPERS + LINE * _MOST_HELPERS, np.int64)
 _yielding = getattr(ctypes.CDLL(None), "sched_yield", None) if os.name == "posix" else None
 if _yielding is not None:
-    _board[YIELD] = ctypes.cast(_yielding, ctypes.c_void_p).value
+    _board[YIELD] = ctypes.cast(_yielding, ctypes.c_void_p).value or 0
 _leading = threading.Lock()
-_followers: list[recorded.Launch] = []
+_followers: list[recorded.Call] = []
 
 
 def _wake(helpers: int) -> None:
