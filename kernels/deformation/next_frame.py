@@ -200,14 +200,14 @@ def keep_finite(
     expect("new", new, (None, 3))
     expect("old", old, tuple(new.shape), device=device)
     expect("finite", finite, (count,), torch.bool, device)
-    kept, still = allocate(new.shape, torch.float32, device), allocate((count,), torch.bool, device)
+    kept, still = allocate(new.shape, torch.float32, device), allocate((count,), torch.uint8, device)
     given = [
         as_argument(start, wp.int32),
         as_argument(new.detach(), wp.vec3),
         as_argument(old.detach(), wp.vec3),
         as_argument(finite.view(torch.uint8), wp.uint8),
     ]
-    written = [as_argument(kept, wp.vec3), as_argument(still.view(torch.uint8), wp.uint8)]
+    written = [as_argument(kept, wp.vec3), as_argument(still, wp.uint8)]
     with torch_stream(device) as warp_device:
         launch_rows(keep_finite_kernel, count, given, written, warp_device, least=16)
-    return kept, still
+    return kept, still.view(torch.bool)

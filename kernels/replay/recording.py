@@ -166,7 +166,7 @@ def addresses(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
 
 
 def passing() -> contextlib.AbstractContextManager[None]:
-    """Context after which nothing is used that `operator.allocate` makes within it, so that its memory is free again."""
+    """Context after which nothing is used that `operator.allocate` makes within it, whose memory is then free."""
     memory = recorded.notes.memory
     return memory.again() if isinstance(memory, GivenOut) else contextlib.nullcontext()
 

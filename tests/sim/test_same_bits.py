@@ -8,7 +8,7 @@ from support.scenes import tube, walk
 import warpgarment as wg
 from warpgarment.nn.rows import SMALL
 
-FRAMES = 4
+FRAMES = 10  # the last ones are replayed
 OFF = 0.01  # mm in the second frame, where only rounding differs; it was 0.0015 mm where it was not zero
 
 

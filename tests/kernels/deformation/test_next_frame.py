@@ -9,7 +9,7 @@ from support.poison import poison_outputs
 
 from warpgarment.kernels import deformation
 from warpgarment.kernels.deformation.face_means import FaceMeans
-from warpgarment.kernels.deformation.next_frame import next_gradients
+from warpgarment.kernels.deformation.next_frame import keep_finite, next_gradients
 
 
 @pytest.fixture(autouse=True)
@@ -204,3 +204,19 @@ def test_gradients_of_face_means_are_those_of_the_mean():
     sums = torch.zeros(count, 3, dtype=torch.float64).index_add(0, segment.long(), centroids)
     ((sums / torch.bincount(segment.long())[:, None]) * weight).sum().backward()
     torch.testing.assert_close(moved.grad.double(), twin.grad, rtol=1e-6, atol=1e-9)
+
+
+def test_positions_that_are_not_finite_are_not_kept():
+    """One garment's NaN would end another garment, or a frame be taken from a garment that has failed before. NumPy,
+    exact; outputs are poisoned."""
+    rng = np.random.default_rng(0)
+    start = np.array([0, 5, 5, 9, 20], np.int32)
+    new, old = (rng.normal(size=(20, 3)).astype(np.float32) for _ in range(2))
+    new[7, 1], new[15, 2] = np.nan, np.inf
+    finite = np.array([True, True, True, False])
+    kept, still = keep_finite(*map(torch.from_numpy, (start, new, old, finite)))
+    assert still.tolist() == [True, True, False, False]
+    np.testing.assert_array_equal(kept, np.concatenate([new[:5], old[5:]]))
+    for wrong in ((new.astype(float), old), (new, old[1:])):
+        with pytest.raises((TypeError, ValueError), match="must"):
+            keep_finite(torch.from_numpy(start), *map(torch.from_numpy, wrong), torch.from_numpy(finite))
