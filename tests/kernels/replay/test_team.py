@@ -65,10 +65,10 @@ def test_several_callers(monkeypatch):
     made = []
     for _ in range(3):
         x, y = torch.zeros(SIZE, dtype=torch.int32), torch.zeros(SIZE, dtype=torch.int32)
-        made.append((x, program(x, y)))
+        made.append((x, y, program(x, y)))
 
     def repeat(number: int) -> None:
-        x, run = made[number]
+        x, _, run = made[number]
         for seed in range(100):
             start = np.random.default_rng(1000 * number + seed).integers(0, MODULUS, SIZE)
             x.copy_(torch.from_numpy(start))
