@@ -30,7 +30,9 @@ ASKS = frozenset(
 """What may be asked of a tensor, since it does not depend on its numbers."""
 MAKES = frozenset("empty empty_like from_numpy new_empty tensor".split())
 """What makes a tensor that is written later, or of numbers that do not change."""
-VIEWS = frozenset("as_strided detach expand unbind view".split())
+VIEWS = frozenset(
+    "as_strided detach expand narrow permute select squeeze transpose unbind unflatten unsqueeze view".split()
+)
 """What only views memory; other operators may, or may copy."""
 WITH_OUT: dict[str, Callable[..., Any]] = {
     "__and__": torch.bitwise_and,
@@ -47,8 +49,8 @@ WITH_OUT: dict[str, Callable[..., Any]] = {
     "where": torch.where,
 }
 """Operators that can write to a given tensor."""
-COMPUTES = frozenset(
-    [*WITH_OUT, *"__getitem__ clone contiguous double flatten float full long new_zeros to zeros zeros_like".split()]
+COMPUTES = frozenset(WITH_OUT) | frozenset(
+    "__getitem__ clone contiguous double flatten float full long new_zeros reshape to zeros zeros_like".split()
 )
 CHANGES = frozenset("add_ copy_".split())
 """Operators that change a tensor."""

@@ -21,7 +21,7 @@ from warpgarment.kernels.dense import products, tokens
 from warpgarment.kernels.dense.turned import MOST_INPUTS, VECTOR, turned
 from warpgarment.kernels.features.channels import FEATURES, LAYOUT, Kind, Layout
 from warpgarment.kernels.operator import allocate
-from warpgarment.kernels.replay.recording import passing
+from warpgarment.kernels.replay.recording import passing, recording
 from warpgarment.nn.inputs import Frames
 from warpgarment.nn.parametrisation import Step
 
@@ -235,7 +235,10 @@ def predict(network: PatchTransformer, inputs: FrameInputs, layout: RowLayout) -
     gradient, body_velocity, body = columns
     shapes = (len(newest), 3, 3), (len(newest), 3), (len(velocities), 3)
     step = Step(*(allocate(shape, newest.dtype, newest.device) for shape in shapes))
-    for view in layout.views:
+    views = layout.views
+    if recording():  # launches of a replay cost little, so each garment goes through all layers while caches hold it
+        views = [one for view in views for one in view.one_by_one]
+    for view in views:
         with passing():
             rows = heads.Rows(view.index, view.piece, layout.face_component)
             found = heads.heading(newest, velocities, rows, weights.heading, gradient, body_velocity)
