@@ -39,9 +39,9 @@ from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows,
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import BEYOND, SEARCHES, Bodies, closest_on_body, has_tree
+from .closest import BEYOND, SEARCHES, closest_on_body
+from .model import Bodies, exists, has_tree
 from .nearest_face import closest_on_triangle
-from .tree import Tree
 from .tree_boxes import boxes_in_box, triangles_above
 from .tree_search import least, least_above, stack64
 
@@ -69,7 +69,7 @@ class SurfaceDepth(NamedTuple):
 
 
 @wp.func
-def depth_at(bodies: Bodies, b: int, point: wp.vec3) -> float:
+def depth_at(bodies: wp.array[Bodies], b: int, point: wp.vec3) -> float:
     """Depth of a point inside a body [m]; 0 outside."""
     depth = wp.float32(0.0)
     _face, sign, _weights, closest = closest_on_body(bodies, b, point, 0.0)
@@ -97,8 +97,11 @@ def foot_of_tips(
 
 
 @wp.func
-def foot_by_tree(tree: Tree, b: int, x: wp.vec3, y: wp.vec3, z: wp.vec3, normal: wp.vec3, low: wp.vec3, high: wp.vec3):
+def foot_by_tree(
+    bodies: wp.array[Bodies], b: int, x: wp.vec3, y: wp.vec3, z: wp.vec3, normal: wp.vec3, low: wp.vec3, high: wp.vec3
+):
     """The point c of a face of the garment; the body's faces are searched in the trees of tree.py."""
+    tree = bodies[0].tree
     most = wp.float32(0.0)
     foot = wp.vec3(wp.nan)
     thick = STANDS_OUT * wp.length(normal)
@@ -133,7 +136,7 @@ def foot_by_tree(tree: Tree, b: int, x: wp.vec3, y: wp.vec3, z: wp.vec3, normal:
 def feet_of_tips(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     faces: wp.array[wp.vec3i],
     # In:
     vertices: wp.array[wp.vec3],
@@ -149,7 +152,7 @@ def feet_of_tips(
     i = from_row + wp.tid()
     feet[i] = wp.vec3(wp.nan)
     b = body_of_vertex[faces[i][0]]
-    if b < 0 or b >= bodies.meshes.shape[0]:
+    if not exists(bodies, b):
         return
     x = vertices[faces[i][0]]
     y = vertices[faces[i][1]]
@@ -164,22 +167,22 @@ def feet_of_tips(
     low = wp.min(x, wp.min(y, z)) - room
     high = wp.max(x, wp.max(y, z)) + room
     if has_tree(bodies):
-        feet[i] = foot_by_tree(bodies.tree, b, x, y, z, normal, low, high)
+        feet[i] = foot_by_tree(bodies, b, x, y, z, normal, low, high)
         return
-    query = wp.mesh_query_aabb(bodies.meshes[b], low, high)
+    query = wp.mesh_query_aabb(bodies[0].meshes[b], low, high)
     face = wp.int32(0)
     most = wp.float32(0.0)
     foot = wp.vec3(wp.nan)
     while wp.mesh_query_aabb_next(query, face):
-        corner = bodies.faces[face + bodies.face_offsets[b]]
+        corner = bodies[0].faces[face + bodies[0].face_offsets[b]]
         most, foot = foot_of_tips(
             x,
             y,
             z,
             normal,
-            bodies.vertices[corner[0]],
-            bodies.vertices[corner[1]],
-            bodies.vertices[corner[2]],
+            bodies[0].vertices[corner[0]],
+            bodies[0].vertices[corner[1]],
+            bodies[0].vertices[corner[2]],
             most,
             foot,
         )
@@ -190,7 +193,7 @@ def feet_of_tips(
 def depth_of_vertices(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     # In:
     vertices: wp.array[wp.vec3],
     body_of_vertex: wp.array[wp.int32],
@@ -206,7 +209,7 @@ def depth_of_vertices(
     depth[i] = 0.0
     clear[i] = 0.0
     b = body_of_vertex[i]
-    if b >= 0 and b < bodies.meshes.shape[0]:
+    if exists(bodies, b):
         if measured.shape[0] > 0:
             moved = wp.length(vertices[i] - measured[i])
             if moved == 0.0:
@@ -239,7 +242,7 @@ def in_a_ball(point: wp.vec3, x: wp.vec3, y: wp.vec3, z: wp.vec3, radius: wp.vec
 def depth_between_vertices(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     edges: wp.array[wp.vec2i],
     faces: wp.array[wp.vec3i],
     # In:
@@ -260,7 +263,7 @@ def depth_between_vertices(
         corner = wp.vec3i(edges[i][0], edges[i][1], edges[i][1])
     between[i] = 0.0
     b = body_of_vertex[corner[0]]
-    if b < 0 or b >= bodies.meshes.shape[0]:
+    if not exists(bodies, b):
         return
     x = vertices[corner[0]]
     y = vertices[corner[1]]
@@ -365,10 +368,10 @@ def surface_depth(
     ]
     with torch_stream(device) as warp_device:
         found = [depths, balls]
-        inputs = [bodies.model, points, body, float(limit), *earlier]
+        inputs = [bodies.argument, points, body, float(limit), *earlier]
         launch_rows(depth_of_vertices, size, inputs, found, warp_device)
-        launch_rows(feet_of_tips, len(faces), [bodies.model, triangles, points, body, balls], [foot], warp_device)
-        inputs = [bodies.model, lines, triangles, points, body, balls, foot]
+        launch_rows(feet_of_tips, len(faces), [bodies.argument, triangles, points, body, balls], [foot], warp_device)
+        inputs = [bodies.argument, lines, triangles, points, body, balls, foot]
         launch_rows(depth_between_vertices, len(between), inputs, [rest], warp_device)
         given = [as_argument(garment_of_vertex, wp.int32), lines, triangles, depths, rest]
         written = [as_argument(missing, wp.float32), as_argument(deepest, wp.float32)]

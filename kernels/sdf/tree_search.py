@@ -12,27 +12,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from .tree import FAR, Tree, vec8, vec8i
+from .model import Bodies
+from .tree import FAR, vec8, vec8i
 
 NEVER = wp.constant(0x7FFFFFFF)
 LANE = wp.constant(7)
 """The bits of a key that are a lane."""
 stack64 = wp.types.vector(length=64, dtype=wp.int32)  # seven for each level, which is enough for eight levels
-
-_ON_CPU = """
-#if defined(__CUDA_ARCH__)
-    return 0;
-#else
-    return 1;
-#endif
-"""
-
-
-@wp.func_native(_ON_CPU)
-def on_cpu() -> int:
-    """1 where kernels are compiled for a CPU. On a GPU the compiler leaves out what depends on it."""
-    ...
-
 
 @wp.func
 def least(k: vec8i):
@@ -186,12 +172,13 @@ def distances_to_triangles(frames: wp.array2d[vec8], leaf: int, px: float, py: f
 
 
 @wp.func
-def nearest_by_tree(tree: Tree, b: int, point: wp.vec3, reach: float) -> int:
+def nearest_by_tree(bodies: wp.array[Bodies], b: int, point: wp.vec3, reach: float) -> int:
     """The face of a body, counted within it, that is nearest to a point; -1 if none is nearer than `reach` [m].
 
     Nodes are kept on a stack, the nearest on top, and children of the last level are looked at in the order of their
     distance, up to the least distance that was found so far.
     """
+    tree = bodies[0].tree
     px = point[0]
     py = point[1]
     pz = point[2]
