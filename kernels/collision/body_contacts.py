@@ -192,6 +192,6 @@ class BodyContacts:
         Returns:
             V contacts without stencils.
         """
-        bodies, on_body, _, epsilon, origin = frame
-        query = bodies.query(vertices.detach(), on_body, within=epsilon)
+        bodies, on_body, _, epsilon, origin, clear = frame
+        query = bodies.query(vertices.detach(), on_body, within=epsilon, clear=clear)
         return contacts(vertices, query.distance, query.face, bodies, epsilon, body_of_vertex=on_body, origin=origin)

@@ -198,6 +198,7 @@ class BodyMeshes:
         body: torch.Tensor | None = None,
         *,
         within: float | torch.Tensor = float("inf"),
+        clear: torch.Tensor | None = None,
     ) -> BodyQuery:
         """Signed distances and closest points, without gradients (see `sdf.signed_distance` for those).
 
@@ -207,6 +208,8 @@ class BodyMeshes:
             within: Distance [m], a number or float32 [N]. For points outside that are at least this far from the body
                 the search stops early and the distance is infinite, which is many times faster. Points inside get an
                 answer at any depth.
+        clear: Radius of a ball around each point that is known to hold no surface, as `surface_depth.Measured` has
+            it [m], float32 [N]. It changes the time only.
         """
         expect("points", points, (None, 3), device=self.device)
         body = self.body_of("body", body, len(points))
@@ -214,7 +217,9 @@ class BodyMeshes:
             expect("within", within, (len(points),), device=self.device)
         else:
             within = torch.full((1,), within, device=self.device)
-        distance, closest, face, _ = query_bodies(self.argument, points.detach(), body, within)
+        if clear is not None:
+            expect("clear", clear, (len(points),), device=self.device)
+        distance, closest, face, _ = query_bodies(self.argument, points.detach(), body, within, clear)
         return BodyQuery(distance, closest, face)
 
 

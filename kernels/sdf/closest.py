@@ -35,6 +35,8 @@ MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its squ
 # less from 0.5.
 WINDING_ACCURACY = wp.constant(2.0)
 INSIDE = wp.constant(0.5)  # winding number of the boundary: closed surfaces have 0 outside and 1 or more inside
+ROUNDING = wp.constant(2.0e-6)
+"""Length [m] by which a ball without surface has to be larger than what is asked for."""
 NOTHING = wp.constant(-1)
 BEYOND = wp.constant(-2)
 
@@ -135,6 +137,7 @@ def query_bodies_kernel(
     points: wp.array[wp.vec3],
     body_of_point: wp.array[wp.int32],
     within: wp.array[wp.float32],
+    clear: wp.array[wp.float32],  # may be empty
     # Out:
     distance: wp.array[wp.float32],
     closest: wp.array[wp.vec3],
@@ -150,6 +153,10 @@ def query_bodies_kernel(
     if not exists(bodies, b):
         return
     reach = within[wp.min(i, within.shape[0] - 1)]
+    if clear.shape[0] > 0:
+        if clear[i] > reach + ROUNDING:
+            distance[i] = wp.inf
+            return
     found, sign, weights, position = closest_on_body(bodies, b, points[i], reach)
     if found == BEYOND:
         distance[i] = wp.inf
@@ -162,7 +169,11 @@ def query_bodies_kernel(
 
 
 def query_bodies(
-    model: Any, points: torch.Tensor, body_of_point: torch.Tensor, within: torch.Tensor
+    model: Any,
+    points: torch.Tensor,
+    body_of_point: torch.Tensor,
+    within: torch.Tensor,
+    clear: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Launches `query_bodies_kernel`.
 
@@ -171,6 +182,8 @@ def query_bodies(
         points: Positions [m], float32 [N, 3].
         body_of_point: Body of each point, int32 [N].
         within: Distance from which points outside are not searched further [m], float32 [N], or [1] for all points.
+        clear: Radius of a ball around each point that is known to hold no surface [m], float32 [N], 0 where the point
+            may be inside; None if nothing is known. It changes the time only.
 
     Returns:
         Signed distance [m], float32 [N]; closest point [m], float32 [N, 3]; packed index of the nearest face, int32
@@ -179,6 +192,7 @@ def query_bodies(
     rows, device = len(points), points.device
     distance, closest = allocate((rows,), torch.float32, device), allocate((rows, 3), torch.float32, device)
     face, barycentric = allocate((rows,), torch.int32, device), allocate((rows, 3), torch.float32, device)
+    clear = distance[:0] if clear is None else clear
     if rows:
         with torch_stream(device) as warp_device:
             launch_rows(
@@ -189,6 +203,7 @@ def query_bodies(
                     as_argument(points, wp.vec3),
                     as_argument(body_of_point, wp.int32),
                     as_argument(within, wp.float32),
+                    as_argument(clear, wp.float32),
                 ],
                 outputs=[
                     as_argument(distance, wp.float32),
