@@ -53,7 +53,7 @@ ROOM = wp.constant(0.01001)
 """Margin of the box around a face in which its tips are [m], a little more than l."""
 COVERED = wp.constant(0.57736)
 """1/√3, and some rounding."""
-MOVED = wp.constant(0.1)
+MOVED = wp.constant(0.25)
 """Part of its ball by which a vertex may have moved since it was measured."""
 
 
