@@ -87,10 +87,15 @@ def closest_on_body(bodies: wp.array[Bodies], b: int, point: wp.vec3, within: fl
     face = NOTHING
     sign = wp.float32(1.0)
     if bodies[0].scattered[b] != 0:
-        around = wp.mesh_query_point_sign_winding_number(bodies[0].meshes[b], point, MAX_DISTANCE, WINDING_ACCURACY, INSIDE)
+        around = wp.mesh_query_point_sign_winding_number(
+            bodies[0].meshes[b], point, MAX_DISTANCE, WINDING_ACCURACY, INSIDE
+        )
         if around.result:
             sign = around.sign
-            if sign < 0.0 or wp.length(wp.vec3d(point) - position_on(bodies, b, around.face, around.u, around.v)) < reach:
+            if (
+                sign < 0.0
+                or wp.length(wp.vec3d(point) - position_on(bodies, b, around.face, around.u, around.v)) < reach
+            ):
                 face = around.face
     else:
         face = found_face(bodies, b, point, reach)

@@ -20,6 +20,7 @@ LANE = wp.constant(7)
 """The bits of a key that are a lane."""
 stack64 = wp.types.vector(length=64, dtype=wp.int32)  # seven for each level, which is enough for eight levels
 
+
 @wp.func
 def least(k: vec8i):
     a = wp.min(k[0], k[4])

@@ -195,8 +195,8 @@ class Contact:
                 on_body = torch.where(state.pending[self._packed.owner], self._body_of_vertex, -1)
             epsilon = distance_to_keep(epsilon, state.missing, vertices, bodies, on_body)
         else:
-            at, inside, clear = self._surface.measured(vertices, bodies, on_body)
-            state = state._replace(at=at, inside=inside, clear=clear)
+            _, inside, clear = self._surface.measured(vertices, bodies, on_body)
+            state = state._replace(at=vertices, inside=inside, clear=clear)
         frame = ContactFrame(bodies, on_body, self._packed.garment_of_vertex, epsilon, origin, state.clear)
         found = self._contacts(vertices, frame)
         return (state._replace(on_body=on_body, epsilon=epsilon), found.normal, found.anchor, found.distance)
