@@ -21,7 +21,7 @@ from warpgarment.kernels.operator import allocate
 
 from .inside import crossings, is_inside
 from .model import Bodies, corners_of, exists, has_tree
-from .nearest_face import closest_on_triangle, named_face, nearest_on_triangle
+from .nearest_face import named_face, nearest_on_triangle
 from .tree_rays import crossings_by_tree
 from .tree_search import nearest_by_tree
 
@@ -73,6 +73,15 @@ def position_on(bodies: wp.array[Bodies], b: int, face: int, u: float, v: float)
 
 
 @wp.func
+def away_from(bodies: wp.array[Bodies], b: int, face: int, point: wp.vec3) -> wp.vec3:
+    """Normal of a face, of any length, to the side of it that a point is on."""
+    corner = bodies[0].faces[bodies[0].face_offsets[b] + face]
+    start = bodies[0].vertices[corner[0]]
+    normal = wp.cross(bodies[0].vertices[corner[1]] - start, bodies[0].vertices[corner[2]] - start)
+    return wp.where(wp.dot(normal, point - start) < 0.0, -normal, normal)
+
+
+@wp.func
 def closest_on_body(bodies: wp.array[Bodies], b: int, point: wp.vec3, within: float):
     """Nearest surface point of a body and the point's side.
 
@@ -103,23 +112,11 @@ def closest_on_body(bodies: wp.array[Bodies], b: int, point: wp.vec3, within: fl
         axis = wp.int32(2)
         side = wp.float32(1.0)
         if face >= 0:
-            first, second, third = corners_of(bodies, b, face)
-            away = point - wp.vec3(closest_on_triangle(wp.vec3d(point), first, second, third))
+            away = away_from(bodies, b, face, point)
             size = wp.vec3(wp.abs(away[0]), wp.abs(away[1]), wp.abs(away[2]))
             axis = wp.where(size[0] > wp.max(size[1], size[2]), 0, wp.where(size[1] > size[2], 1, 2))
             side = wp.where(away[axis] < 0.0, -1.0, 1.0)
-        if is_inside(
-            body_crossings(bodies, b, point, axis, side),
-            bodies[0].vertices,
-            bodies[0].caps,
-            bodies[0].loops,
-            bodies[0].loop_size,
-            bodies[0].loop_offsets[b],
-            bodies[0].loop_offsets[b + 1],
-            point,
-            axis,
-            side,
-        ):
+        if is_inside(bodies, b, body_crossings(bodies, b, point, axis, side), point, axis, side):
             sign = -1.0
             if face < 0:
                 face = found_face(bodies, b, point, MAX_DISTANCE)
