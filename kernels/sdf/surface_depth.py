@@ -238,13 +238,17 @@ def depth_of_vertices(
 
 
 @wp.func
+def in_ball(point: wp.vec3, centre: wp.vec3, radius: float) -> bool:
+    """Whether a point is in a ball without surface."""
+    away = point - centre
+    inner = wp.max(radius - ROUNDING, 0.0)
+    return wp.dot(away, away) < inner * inner
+
+
+@wp.func
 def in_a_ball(point: wp.vec3, x: wp.vec3, y: wp.vec3, z: wp.vec3, radius: wp.vec3) -> bool:
     """Whether a point is in the ball without surface around a corner."""
-    return (
-        wp.length(point - x) + ROUNDING < radius[0]
-        or wp.length(point - y) + ROUNDING < radius[1]
-        or wp.length(point - z) + ROUNDING < radius[2]
-    )
+    return in_ball(point, x, radius[0]) or in_ball(point, y, radius[1]) or in_ball(point, z, radius[2])
 
 
 @wp.kernel(enable_backward=False, module=SEARCHES)
@@ -283,7 +287,7 @@ def depth_between_vertices(
     if is_face:
         middle = (x + y + z) / 3.0
         foot = feet[i - edges.shape[0]]
-        if not in_a_ball(foot, x, y, z, radius):
+        if not (wp.isnan(foot[0]) or in_a_ball(foot, x, y, z, radius)):
             worst = depth_at(bodies, b, foot)
     if not in_a_ball(middle, x, y, z, radius):
         worst = wp.max(worst, depth_at(bodies, b, middle))
