@@ -107,7 +107,8 @@ def closest_on_body(bodies: wp.array[Bodies], b: int, point: wp.vec3, within: fl
             ):
                 face = around.face
     else:
-        face = found_face(bodies, b, point, reach)
+        if reach > 0.0:
+            face = found_face(bodies, b, point, reach)
         # The ray leads away from the surface, where it meets fewer faces; any other ray gives the same sign.
         axis = wp.int32(2)
         side = wp.float32(1.0)

@@ -187,29 +187,32 @@ def nearest_by_tree(bodies: wp.array[Bodies], b: int, point: wp.vec3, reach: flo
     face = wp.int32(-1)
     nodes = stack64()
     bounds = stack64()
-    nodes[0] = tree.nodes[b]
-    top = wp.int32(1)
-    while top > 0:
-        top -= 1
-        if bounds[top] < best:
-            node = nodes[top]
-            keys = distances_to_boxes(tree.boxes, node, px, py, pz)
-            first = tree.children[node]
-            if first < 0:
-                key = least(keys)
-                while key < best:
-                    leaf = ~first + (key & LANE)
-                    bits = distances_to_triangles(tree.frames, leaf, px, py, pz)
-                    found = least(bits)
-                    if found < best:
-                        best = found
-                        face = tree.faces[leaf][lane_of(bits, found)]
-                    key = least_above(keys, key)
-            else:
-                key = most_below(keys, best)
-                while key >= 0:
-                    nodes[top] = first + (key & LANE)
-                    bounds[top] = key & ~LANE
-                    top += 1
-                    key = most_below(keys, key)
+    top = wp.int32(0)
+    node = tree.nodes[b]
+    while node >= 0:
+        keys = distances_to_boxes(tree.boxes, node, px, py, pz)
+        first = tree.children[node]
+        node = wp.int32(-1)
+        near = least(keys)
+        if first < 0:
+            while near < best:
+                leaf = ~first + (near & LANE)
+                bits = distances_to_triangles(tree.frames, leaf, px, py, pz)
+                found = least(bits)
+                if found < best:
+                    best = found
+                    face = tree.faces[leaf][lane_of(bits, found)]
+                near = least_above(keys, near)
+        elif near < best:
+            node = first + (near & LANE)
+            key = most_below(keys, best)
+            while key > near:
+                nodes[top] = first + (key & LANE)
+                bounds[top] = key & ~LANE
+                top += 1
+                key = most_below(keys, key)
+        while node < 0 and top > 0:
+            top -= 1
+            if bounds[top] < best:
+                node = nodes[top]
     return face
