@@ -18,7 +18,8 @@ from warpgarment.kernels import compiling
 from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.closest import Bodies
+from warpgarment.kernels.sdf.first_hit import first_hit
+from warpgarment.kernels.sdf.model import Bodies, corners_of, exists
 from warpgarment.kernels.sdf.nearest_face import closest_on_triangle
 
 from .contact_set import ContactFrame, Contacts
@@ -34,26 +35,26 @@ BEYOND = wp.constant(wp.float64(1e-4))
 
 
 @wp.func
-def entered(bodies: Bodies, b: int, origin: wp.vec3, end: wp.vec3) -> int:
-    """Packed index of the face by which a segment enters a body; -1 if its first hit is an exit, or there is none."""
+def entered(bodies: wp.array[Bodies], b: int, origin: wp.vec3, end: wp.vec3) -> int:
+    """Face of a body by which a segment enters it; -1 if its first hit is an exit, or there is none."""
     way = end - origin
     length = wp.length(way)
-    if b < 0 or b >= bodies.meshes.shape[0] or not (length > 0.0 and wp.isfinite(length)):
+    if not exists(bodies, b) or not (length > 0.0 and wp.isfinite(length)):
         return -1
-    hit = wp.mesh_query_ray(bodies.meshes[b], origin, way / length, length)
-    if not hit.result or wp.dot(hit.normal, way) >= 0.0:
+    face, _far, turned = first_hit(bodies, b, origin, way / length, length)
+    if face < 0 or turned > 0.0:
         return -1
-    return hit.face + bodies.face_offsets[b]
+    return face
 
 
 @wp.func
-def half_of_the_room(mesh: wp.uint64, point: wp.vec3, outward: wp.vec3, distance: float) -> float:
+def half_of_the_room(bodies: wp.array[Bodies], b: int, point: wp.vec3, outward: wp.vec3, distance: float) -> float:
     """Half of the way from a surface to what is opposite [m]; infinite where that is further than twice a distance."""
     start = wp.float32(BEYOND)
-    hit = wp.mesh_query_ray(mesh, point + start * outward, outward, 2.0 * distance)
+    face, far, turned = first_hit(bodies, b, point + start * outward, outward, 2.0 * distance)
     half = wp.float32(wp.inf)
-    if hit.result and wp.dot(hit.normal, outward) < 0.0:
-        half = 0.5 * (start + hit.t)
+    if face >= 0 and turned < 0.0:
+        half = 0.5 * (start + far)
     return half
 
 
@@ -61,7 +62,7 @@ def half_of_the_room(mesh: wp.uint64, point: wp.vec3, outward: wp.vec3, distance
 def find_contacts(
     from_row: wp.int32,
     # Body:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     # In:
     vertices: wp.array[wp.vec3],
     distance: wp.array[wp.float32],
@@ -83,11 +84,10 @@ def find_contacts(
     u = wp.vec3d()
     keep = epsilon[wp.min(i, epsilon.shape[0] - 1)]
     if distance[i] < keep:
+        body = body_of_vertex[i]
         p = wp.vec3d(vertices[i])
-        corner = bodies.faces[face[i]]
-        a = wp.vec3d(bodies.vertices[corner[0]])
-        b = wp.vec3d(bodies.vertices[corner[1]])
-        c = wp.vec3d(bodies.vertices[corner[2]])
+        first = bodies[0].face_offsets[body]
+        a, b, c = corners_of(bodies, body, face[i] - first)
         u = closest_on_triangle(p, a, b, c)
         edge = b - a
         length = wp.length(p - u)
@@ -98,24 +98,21 @@ def find_contacts(
         else:
             n = wp.normalize(wp.cross(b - a, c - a))
         if distance[i] < 0.0 and origin.shape[0] > 0:
-            entry = entered(bodies, body_of_vertex[i], origin[i], vertices[i])
+            entry = entered(bodies, body, origin[i], vertices[i])
             if entry >= 0:
-                corner = bodies.faces[entry]
-                a = wp.vec3d(bodies.vertices[corner[0]])
-                first = wp.vec3d(bodies.vertices[corner[1]]) - a
-                outward = wp.normalize(wp.cross(first, wp.vec3d(bodies.vertices[corner[2]]) - a))
+                a, b, c = corners_of(bodies, body, entry)
+                outward = wp.normalize(wp.cross(b - a, c - a))
                 if wp.dot(outward, n) < wp.float64(0.0):
-                    edge = first
+                    edge = b - a
                     u = p - wp.dot(outward, p - a) * outward  # as good as any point of its plane
                     n = outward
         if distance[i] < 0.0:
-            mesh = bodies.meshes[body_of_vertex[i]]
-            if not leads_out(mesh, wp.vec3(u + BEYOND * n), wp.vec3(n)):
-                way, far = way_out(mesh, vertices[i], wp.vec3(n), wp.vec3(edge))
+            if not leads_out(bodies, body, wp.vec3(u + BEYOND * n), wp.vec3(n)):
+                way, far = way_out(bodies, body, vertices[i], wp.vec3(n), wp.vec3(edge))
                 if far >= 0.0:
                     n = wp.vec3d(way)
                     u = p + wp.float64(far) * n
-        keep = wp.min(keep, half_of_the_room(bodies.meshes[body_of_vertex[i]], wp.vec3(u), wp.vec3(n), keep))
+        keep = wp.min(keep, half_of_the_room(bodies, body, wp.vec3(u), wp.vec3(n), keep))
         if not wp.dot(n, p - u) < wp.float64(keep):
             n = wp.vec3d()
     closest[i] = u
@@ -163,7 +160,7 @@ def contacts(
             find_contacts,
             len(vertices),
             inputs=[
-                bodies.model,
+                bodies.argument,
                 as_argument(vertices, wp.vec3),
                 as_argument(distance, wp.float32),
                 as_argument(face, wp.int32),
@@ -195,6 +192,6 @@ class BodyContacts:
         Returns:
             V contacts without stencils.
         """
-        bodies, on_body, _, epsilon, origin = frame
-        query = bodies.query(vertices.detach(), on_body, within=epsilon)
+        bodies, on_body, _, epsilon, origin, clear = frame
+        query = bodies.query(vertices.detach(), on_body, within=epsilon, clear=clear)
         return contacts(vertices, query.distance, query.face, bodies, epsilon, body_of_vertex=on_body, origin=origin)

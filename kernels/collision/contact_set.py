@@ -63,6 +63,8 @@ class ContactFrame(NamedTuple):
     """Distance to keep from the bodies [m], a number or float32 [V]."""
     origin: torch.Tensor | None = None
     """Positions of vertices if they had moved with the body [m], float32 [V,3], see `features.carry`, or NaN."""
+    clear: torch.Tensor | None = None
+    """Radius of the ball around each vertex that is known to hold no surface of its body [m], float32 [V]."""
 
 
 class ContactSource(Protocol):

@@ -14,12 +14,15 @@ look worse than cloth that stays between the two parts, where nobody sees it.
 | symbol | code | what |
 | --- | --- | --- |
 | r | `way` | unit vector |
-| t_k, n_j | `hit.t`, `hit.normal` | distance of a crossing along the way [m], the normal of the face there |
+| t_k, s_j | `far`, `turned` | distance of a crossing along the way [m]; its sign |
 """
 
 from __future__ import annotations
 
 import warp as wp
+
+from warpgarment.kernels.sdf.first_hit import first_hit
+from warpgarment.kernels.sdf.model import Bodies
 
 LONGEST = wp.constant(wp.float32(0.05))
 """Longest way out [m]: somewhat more than the thickness of a hand."""
@@ -31,17 +34,17 @@ BEHIND = wp.constant(wp.float32(1.0e-5))
 
 
 @wp.func
-def length_of_way(mesh: wp.uint64, point: wp.vec3, way: wp.vec3) -> float:
+def length_of_way(bodies: wp.array[Bodies], b: int, point: wp.vec3, way: wp.vec3) -> float:
     """Distance from a point inside a body to where a ray leaves it [m]; -1 where it is not inside, along this ray."""
     turns = wp.int32(0)
     leaves = wp.vec4(-1.0)  # where the sum of s_j reaches 1, 2, 3 and 4 for the first time
     far = wp.float32(0.0)
     for _k in range(CROSSINGS):
-        hit = wp.mesh_query_ray(mesh, point + far * way, way, FAR)
-        if not hit.result:
+        face, step, turned = first_hit(bodies, b, point + far * way, way, FAR)
+        if face < 0:
             break
-        far += hit.t
-        if wp.dot(hit.normal, way) > 0.0:
+        far += step
+        if turned > 0.0:
             turns += 1
             if turns >= 1 and turns <= 4:
                 if leaves[turns - 1] < 0.0:
@@ -56,11 +59,12 @@ def length_of_way(mesh: wp.uint64, point: wp.vec3, way: wp.vec3) -> float:
 
 
 @wp.func
-def way_out(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, edge: wp.vec3):
+def way_out(bodies: wp.array[Bodies], b: int, point: wp.vec3, normal: wp.vec3, edge: wp.vec3):
     """The shortest of ten ways out of a body.
 
     Args:
-        mesh: The body.
+        bodies: The bodies.
+        b: The body.
         point: A position inside [m].
         normal: Direction of a contact there, a unit vector.
         edge: Any direction that is not parallel to it, such as an edge of the face that is touched.
@@ -81,7 +85,7 @@ def way_out(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, edge: wp.vec3):
             way = wp.where(k % 2 == 0, across, -across)
             if k >= 6:
                 way = wp.normalize(way + normal)
-        length = length_of_way(mesh, point, way)
+        length = length_of_way(bodies, b, point, way)
         if length >= 0.0 and length < least:
             least = length
             best = way
@@ -89,6 +93,6 @@ def way_out(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, edge: wp.vec3):
 
 
 @wp.func
-def leads_out(mesh: wp.uint64, point: wp.vec3, way: wp.vec3) -> bool:
+def leads_out(bodies: wp.array[Bodies], b: int, point: wp.vec3, way: wp.vec3) -> bool:
     """Whether a point is outside of a body, seen along a ray from it."""
-    return length_of_way(mesh, point, way) < 0.0
+    return length_of_way(bodies, b, point, way) < 0.0

@@ -32,7 +32,8 @@ from warpgarment.kernels.deformation.svd import frame_singular_values
 from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate, row_operator
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.closest import MAX_DISTANCE, Bodies, closest_on_body
+from warpgarment.kernels.sdf.closest import MAX_DISTANCE, closest_on_body
+from warpgarment.kernels.sdf.model import Bodies, exists
 
 from .channels import FEATURES, LAYOUT
 
@@ -75,21 +76,22 @@ def frame_or_zero(a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 
 @wp.func
-def nearest_motion(bodies: Bodies, b: int, point: wp.vec3, next_vertices: wp.array[wp.vec3]):
+def nearest_motion(bodies: wp.array[Bodies], b: int, point: wp.vec3, next_vertices: wp.array[wp.vec3]):
     """The fields of `BodyInteraction` of one point."""
     closest = wp.vec3(wp.nan)
     sign = wp.float32(1.0)
     face = wp.int32(-1)
     deformation = wp.identity(n=3, dtype=wp.float32)
     velocity = wp.vec3(0.0)
-    if b >= 0 and b < bodies.meshes.shape[0]:
+    if exists(bodies, b):
         found, side, _weights, position = closest_on_body(bodies, b, point, MAX_DISTANCE)
         if found >= 0:
             closest = wp.vec3(position)
             sign = side
-            face = found + bodies.face_offsets[b]
-            corner = bodies.faces[face]
-            a0, a1, a2 = bodies.vertices[corner[0]], bodies.vertices[corner[1]], bodies.vertices[corner[2]]
+            face = found + bodies[0].face_offsets[b]
+            corner = bodies[0].faces[face]
+            at = bodies[0].vertices
+            a0, a1, a2 = at[corner[0]], at[corner[1]], at[corner[2]]
             b0, b1, b2 = next_vertices[corner[0]], next_vertices[corner[1]], next_vertices[corner[2]]
             velocity = ((b0 - a0) + (b1 - a1) + (b2 - a2)) / 3.0
             q = frame_or_zero(a0, a1, a2)
@@ -103,7 +105,7 @@ def nearest_motion(bodies: Bodies, b: int, point: wp.vec3, next_vertices: wp.arr
 def body_interaction_kernel(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     # In:
     centroids: wp.array[wp.vec3],
     body_of_face: wp.array[wp.int32],
@@ -268,7 +270,7 @@ def body_interaction(
                 body_interaction_kernel,
                 rows,
                 inputs=[
-                    bodies.model,
+                    bodies.argument,
                     as_argument(centroids, wp.vec3),
                     as_argument(body_of_face, wp.int32),
                     as_argument(next_vertices, wp.vec3),

@@ -13,7 +13,8 @@ from warpgarment.kernels.deformation.gradients import expect_mesh
 from warpgarment.kernels.launch import as_argument, expect, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.closest import SEARCHES, Bodies
+from warpgarment.kernels.sdf.closest import SEARCHES
+from warpgarment.kernels.sdf.model import Bodies
 
 from .channels import FEATURES
 from .face import face_and_mean, nearest_motion, write_features
@@ -23,7 +24,7 @@ from .face import face_and_mean, nearest_motion, write_features
 def frame_features_kernel(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     inverse_rest: wp.array[wp.mat33],
     faces: wp.array[wp.vec3i],
     garment_of_face: wp.array[wp.int32],
@@ -79,7 +80,7 @@ def frame_features(
                 frame_features_kernel,
                 rows,
                 inputs=[
-                    bodies.model,
+                    bodies.argument,
                     as_argument(inverse_rest, wp.mat33),
                     as_argument(faces, wp.vec3i),
                     as_argument(garment_of_face, wp.int32),

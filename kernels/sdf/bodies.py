@@ -1,8 +1,8 @@
-"""Bodies as Warp meshes: checked, built once, refitted as they move, queried for closest points.
+"""Bodies: checked, their trees built once, refitted as they move, queried for closest points.
 
-There is one `wp.Mesh` per body, since a point of one garment must not see another garment's body. Vertices and faces
-are packed as in all kernels; the ids of the meshes are passed to a kernel as an array that is indexed by the body of
-each point. The kernels of the queries are in closest.py.
+There is one tree per body, since a point of one garment must not see another garment's body: that of tree.py on a CPU,
+of a `wp.Mesh` on a GPU and for bodies in pieces, whose signs are sums of solid angles. Vertices and faces are packed as
+in all kernels, which get the memory of all bodies as one argument. The kernels of the queries are in closest.py.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from warpgarment.kernels.mesh.caps import caps_of, joined
 from warpgarment.kernels.replay.recording import also
 
 from . import inside, nearest_face
-from .closest import Bodies, query_bodies
+from .closest import query_bodies
 from .inside import loop_size_kernel
+from .model import Bodies
 from .tree import Trees, no_trees
 
 LEAF_SIZE = 2
@@ -52,7 +53,7 @@ class BodyMeshes:
 
     Args:
         vertices: Positions [m], float32 [U, 3]; they are copied.
-        faces: Packed (global) vertex indices, int32 [G, 3]; they are kept.
+        faces: Packed (global) vertex indices, int32 [G, 3]; they are copied.
         vertex_offsets: Index at which the vertices of each body begin, and U, integers [B + 1]; None for one body.
         face_offsets: Index at which the faces of each body begin, and G, integers [B + 1]; None for one body.
         wide: Whether nearest faces and rays are searched in trees eight wide, which works on a CPU only, or in Warp's;
@@ -85,36 +86,33 @@ class BodyMeshes:
 
         self.count = len(starts) - 1
         self._vertices = vertices.detach().clone(memory_format=torch.contiguous_format)
-        self._faces = faces.detach().contiguous()
+        self._faces = faces.detach().clone(memory_format=torch.contiguous_format)
         first, parts = _topologies(self._faces.cpu().numpy(), starts, face_starts)
-        caps_of_part, rings, indices = {}, {}, {}
+        caps_of_part, rings = {}, {}
         for b, (part, count) in parts.items():
             caps_of_part[b] = kept.of("caps", (part, count), partial(caps_of, part, count))
             rings[b] = kept.of("rings", (part,), partial(nearest_face.rings_of, part))
-            indices[b] = torch.from_numpy(part).flatten().to(vertices.device)
         caps = joined([caps_of_part[b] for b in first], starts)
         ring_starts = dict(zip(rings, np.cumsum([0, *map(len, rings.values())]).tolist(), strict=False))
         many = [int(caps.loops[b] - caps.loops[a]) > inside.MOST_CAPS for a, b in pairwise(caps.bodies.tolist())]
-        self._meshes: list[wp.Mesh] = []
+        wide = vertices.device.type == "cpu" if wide is None else wide
+        self._meshes: dict[int, wp.Mesh] = {}  # where they are searched
         with torch_stream(vertices.device):
             for b in range(self.count):
-                points = self._vertices[starts[b] : starts[b + 1]]
-                self._meshes.append(
-                    wp.Mesh(
-                        as_warp(points, wp.vec3),
-                        as_warp(indices[first[b]], wp.int32),
-                        support_winding_number=many[b],
-                        bvh_leaf_size=LEAF_SIZE,
+                if not wide or many[b]:
+                    points = as_warp(self._vertices[starts[b] : starts[b + 1]], wp.vec3)
+                    triangles = as_warp(torch.from_numpy(parts[first[b]][0]).flatten().to(vertices.device), wp.int32)
+                    self._meshes[b] = wp.Mesh(
+                        points, triangles, support_winding_number=many[b], bvh_leaf_size=LEAF_SIZE
                     )
-                )
 
         def integers(values: Any, dtype: torch.dtype = torch.int32) -> torch.Tensor:
             return torch.as_tensor(values, dtype=dtype).to(vertices.device)
 
-        self.mesh_ids = integers([mesh.id for mesh in self._meshes], torch.int64)
+        meshes = [self._meshes[b].id if b in self._meshes else 0 for b in range(self.count)]
+        self.mesh_ids = integers(meshes, torch.int64)
         self.face_offsets = integers(face_starts)
         self.model = Bodies()
-        """Argument of kernels: arrays over the memory of this object, which must outlive their launches."""
         tensors = {
             "meshes": (self.mesh_ids, wp.uint64),
             "face_offsets": (self.face_offsets, wp.int32),
@@ -131,9 +129,10 @@ class BodyMeshes:
         for name, (tensor, kind) in tensors.items():
             setattr(self.model, name, as_warp(tensor, kind))
         self._memory = tensors
-        wide = vertices.device.type == "cpu" if wide is None else wide
         self._trees = Trees(self._vertices, self._faces, face_starts) if wide else None
         self.model.tree = self._trees.model if self._trees else no_trees(vertices.device)
+        self.argument = wp.array([self.model], dtype=Bodies, device=str(vertices.device))
+        """Argument of kernels: arrays over the memory of this object, which must outlive their launches."""
         self._measure_loops()
 
     @property
@@ -161,7 +160,7 @@ class BodyMeshes:
         expect("body vertices", vertices, tuple(self._vertices.shape), device=self.device)
         self._vertices.copy_(vertices.detach())
         with torch_stream(self.device):
-            for mesh in self._meshes:
+            for mesh in self._meshes.values():
                 also(mesh.refit)
         if self._trees:
             self._trees.refit()
@@ -199,6 +198,7 @@ class BodyMeshes:
         body: torch.Tensor | None = None,
         *,
         within: float | torch.Tensor = float("inf"),
+        clear: torch.Tensor | None = None,
     ) -> BodyQuery:
         """Signed distances and closest points, without gradients (see `sdf.signed_distance` for those).
 
@@ -208,6 +208,8 @@ class BodyMeshes:
             within: Distance [m], a number or float32 [N]. For points outside that are at least this far from the body
                 the search stops early and the distance is infinite, which is many times faster. Points inside get an
                 answer at any depth.
+        clear: Radius of a ball around each point that is known to hold no surface, as `surface_depth.Measured` has
+            it [m], float32 [N]. It changes the time only.
         """
         expect("points", points, (None, 3), device=self.device)
         body = self.body_of("body", body, len(points))
@@ -215,7 +217,9 @@ class BodyMeshes:
             expect("within", within, (len(points),), device=self.device)
         else:
             within = torch.full((1,), within, device=self.device)
-        distance, closest, face, _ = query_bodies(self.model, points.detach(), body, within)
+        if clear is not None:
+            expect("clear", clear, (len(points),), device=self.device)
+        distance, closest, face, _ = query_bodies(self.argument, points.detach(), body, within, clear)
         return BodyQuery(distance, closest, face)
 
 

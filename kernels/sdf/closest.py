@@ -20,10 +20,10 @@ from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .inside import crossings, is_inside
-from .nearest_face import closest_on_triangle, corners_of, named_face, nearest_on_triangle
-from .tree import Tree
+from .model import Bodies, corners_of, exists, has_tree
+from .nearest_face import named_face, nearest_on_triangle
 from .tree_rays import crossings_by_tree
-from .tree_search import nearest_by_tree, on_cpu
+from .tree_search import nearest_by_tree
 
 wp.set_module_options(compiling.options())
 SEARCHES = compiling.apart("warpgarment.kernels.sdf.searches")
@@ -35,71 +35,54 @@ MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its squ
 # less from 0.5.
 WINDING_ACCURACY = wp.constant(2.0)
 INSIDE = wp.constant(0.5)  # winding number of the boundary: closed surfaces have 0 outside and 1 or more inside
+ROUNDING = wp.constant(2.0e-6)
+"""Length [m] by which a ball without surface has to be larger than what is asked for."""
 NOTHING = wp.constant(-1)
 BEYOND = wp.constant(-2)
 
 
-@wp.struct
-class Bodies:
-    """A packed batch of bodies as an argument of kernels."""
-
-    meshes: wp.array[wp.uint64]  # of each body
-    face_offsets: wp.array[wp.int32]
-    faces: wp.array[wp.vec3i]  # packed vertex indices
-    vertices: wp.array[wp.vec3]
-    rings: wp.array2d[wp.int32]  # faces that share a corner or an edge, see nearest_face.rings_of
-    ring_offsets: wp.array[wp.int32]  # first row of each body in `rings`; bodies of the same faces share theirs
-    scattered: wp.array[wp.int32]  # whether a body has too many holes to be closed by caps
-    loop_offsets: wp.array[wp.int32]  # loops of each body, see mesh.caps.Caps
-    loops: wp.array[wp.int32]
-    caps: wp.array[wp.vec3i]
-    loop_size: wp.array[wp.vec2]
-    tree: Tree  # of all bodies; without nodes on a GPU
-
-
 @wp.func
-def has_tree(bodies: Bodies) -> bool:
-    """Whether the trees of tree.py are searched, not Warp's; false on every GPU."""
-    return on_cpu() != 0 and bodies.tree.nodes.shape[0] > 0
-
-
-@wp.func
-def found_face(bodies: Bodies, b: int, point: wp.vec3, reach: float) -> int:
+def found_face(bodies: wp.array[Bodies], b: int, point: wp.vec3, reach: float) -> int:
     """The face of a body, counted within it, that a search in float32 finds; NOTHING if none is nearer than `reach`."""
     face = NOTHING
     if has_tree(bodies):
-        face = nearest_by_tree(bodies.tree, b, point, reach)
+        face = nearest_by_tree(bodies, b, point, reach)
     else:
-        near = wp.mesh_query_point_no_sign(bodies.meshes[b], point, reach)
+        near = wp.mesh_query_point_no_sign(bodies[0].meshes[b], point, reach)
         if near.result:
             face = near.face
     return face
 
 
 @wp.func
-def body_crossings(bodies: Bodies, b: int, point: wp.vec3, axis: int, side: float) -> int:
+def body_crossings(bodies: wp.array[Bodies], b: int, point: wp.vec3, axis: int, side: float) -> int:
     """Signed number of crossings of a ray along an axis with a body."""
     crossed = wp.int32(0)
     if has_tree(bodies):
-        crossed = crossings_by_tree(bodies.tree, b, point, axis, side)
+        crossed = crossings_by_tree(bodies, b, point, axis, side)
     else:
-        crossed = crossings(bodies.meshes[b], point, axis, side)
+        crossed = crossings(bodies[0].meshes[b], point, axis, side)
     return crossed
 
 
 @wp.func
-def position_on(mesh: wp.uint64, face: int, u: float, v: float):
+def position_on(bodies: wp.array[Bodies], b: int, face: int, u: float, v: float):
     """The point with two barycentric coordinates, in float64."""
-    body = wp.mesh_get(mesh)
-    a = wp.vec3d(body.points[body.indices[3 * face]])
-    b = wp.vec3d(body.points[body.indices[3 * face + 1]])
-    c = wp.vec3d(body.points[body.indices[3 * face + 2]])
-    w = 1.0 - u - v
-    return a * wp.float64(u) + b * wp.float64(v) + c * wp.float64(w)
+    p, q, r = corners_of(bodies, b, face)
+    return p * wp.float64(u) + q * wp.float64(v) + r * wp.float64(1.0 - u - v)
 
 
 @wp.func
-def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
+def away_from(bodies: wp.array[Bodies], b: int, face: int, point: wp.vec3) -> wp.vec3:
+    """Normal of a face, of any length, to the side of it that a point is on."""
+    corner = bodies[0].faces[bodies[0].face_offsets[b] + face]
+    start = bodies[0].vertices[corner[0]]
+    normal = wp.cross(bodies[0].vertices[corner[1]] - start, bodies[0].vertices[corner[2]] - start)
+    return wp.where(wp.dot(normal, point - start) < 0.0, -normal, normal)
+
+
+@wp.func
+def closest_on_body(bodies: wp.array[Bodies], b: int, point: wp.vec3, within: float):
     """Nearest surface point of a body and the point's side.
 
     Returns:
@@ -109,39 +92,32 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
     nowhere = wp.vec3(wp.nan)
     if not wp.isfinite(point):
         return NOTHING, 1.0, nowhere, wp.vec3d(nowhere)
-    mesh = bodies.meshes[b]
     reach = wp.min(within, MAX_DISTANCE)
     face = NOTHING
     sign = wp.float32(1.0)
-    if bodies.scattered[b] != 0:
-        around = wp.mesh_query_point_sign_winding_number(mesh, point, MAX_DISTANCE, WINDING_ACCURACY, INSIDE)
+    if bodies[0].scattered[b] != 0:
+        around = wp.mesh_query_point_sign_winding_number(
+            bodies[0].meshes[b], point, MAX_DISTANCE, WINDING_ACCURACY, INSIDE
+        )
         if around.result:
             sign = around.sign
-            if sign < 0.0 or wp.length(wp.vec3d(point) - position_on(mesh, around.face, around.u, around.v)) < reach:
+            if (
+                sign < 0.0
+                or wp.length(wp.vec3d(point) - position_on(bodies, b, around.face, around.u, around.v)) < reach
+            ):
                 face = around.face
     else:
-        face = found_face(bodies, b, point, reach)
+        if reach > 0.0:
+            face = found_face(bodies, b, point, reach)
         # The ray leads away from the surface, where it meets fewer faces; any other ray gives the same sign.
         axis = wp.int32(2)
         side = wp.float32(1.0)
         if face >= 0:
-            first, second, third = corners_of(mesh, face)
-            away = point - wp.vec3(closest_on_triangle(wp.vec3d(point), first, second, third))
+            away = away_from(bodies, b, face, point)
             size = wp.vec3(wp.abs(away[0]), wp.abs(away[1]), wp.abs(away[2]))
             axis = wp.where(size[0] > wp.max(size[1], size[2]), 0, wp.where(size[1] > size[2], 1, 2))
             side = wp.where(away[axis] < 0.0, -1.0, 1.0)
-        if is_inside(
-            body_crossings(bodies, b, point, axis, side),
-            bodies.vertices,
-            bodies.caps,
-            bodies.loops,
-            bodies.loop_size,
-            bodies.loop_offsets[b],
-            bodies.loop_offsets[b + 1],
-            point,
-            axis,
-            side,
-        ):
+        if is_inside(bodies, b, body_crossings(bodies, b, point, axis, side), point, axis, side):
             sign = -1.0
             if face < 0:
                 face = found_face(bodies, b, point, MAX_DISTANCE)
@@ -149,8 +125,8 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
         return wp.where(reach < MAX_DISTANCE, BEYOND, NOTHING), sign, nowhere, wp.vec3d(nowhere)
     # The search is in float32. Distances are flat around their minimum: where one is right to 1e-7 m, its point may be
     # 1e-4 m off. So the point is computed again, on the face that is named.
-    named = named_face(mesh, bodies.rings, bodies.ring_offsets[b], face, point)
-    p, q, r = corners_of(mesh, named)
+    named = named_face(bodies, b, face, point)
+    p, q, r = corners_of(bodies, b, named)
     weights = nearest_on_triangle(wp.vec3d(point), p, q, r)
     return named, sign, wp.vec3(weights), weights[0] * p + weights[1] * q + weights[2] * r
 
@@ -159,11 +135,12 @@ def closest_on_body(bodies: Bodies, b: int, point: wp.vec3, within: float):
 def query_bodies_kernel(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     # In:
     points: wp.array[wp.vec3],
     body_of_point: wp.array[wp.int32],
     within: wp.array[wp.float32],
+    clear: wp.array[wp.float32],  # may be empty
     # Out:
     distance: wp.array[wp.float32],
     closest: wp.array[wp.vec3],
@@ -176,9 +153,13 @@ def query_bodies_kernel(
     closest[i] = wp.vec3(wp.nan)
     face[i] = -1
     barycentric[i] = wp.vec3(wp.nan)
-    if b < 0 or b >= bodies.meshes.shape[0]:
+    if not exists(bodies, b):
         return
     reach = within[wp.min(i, within.shape[0] - 1)]
+    if clear.shape[0] > 0:
+        if clear[i] > reach + ROUNDING:
+            distance[i] = wp.inf
+            return
     found, sign, weights, position = closest_on_body(bodies, b, points[i], reach)
     if found == BEYOND:
         distance[i] = wp.inf
@@ -186,20 +167,26 @@ def query_bodies_kernel(
         return
     distance[i] = sign * wp.float32(wp.length(wp.vec3d(points[i]) - position))
     closest[i] = wp.vec3(position)
-    face[i] = found + bodies.face_offsets[b]
+    face[i] = found + bodies[0].face_offsets[b]
     barycentric[i] = weights
 
 
 def query_bodies(
-    model: Any, points: torch.Tensor, body_of_point: torch.Tensor, within: torch.Tensor
+    model: Any,
+    points: torch.Tensor,
+    body_of_point: torch.Tensor,
+    within: torch.Tensor,
+    clear: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Launches `query_bodies_kernel`.
 
     Args:
-        model: The bodies, `BodyMeshes.model`.
+        model: The bodies, `BodyMeshes.argument`.
         points: Positions [m], float32 [N, 3].
         body_of_point: Body of each point, int32 [N].
         within: Distance from which points outside are not searched further [m], float32 [N], or [1] for all points.
+        clear: Radius of a ball around each point that is known to hold no surface [m], float32 [N], 0 where the point
+            may be inside; None if nothing is known. It changes the time only.
 
     Returns:
         Signed distance [m], float32 [N]; closest point [m], float32 [N, 3]; packed index of the nearest face, int32
@@ -208,6 +195,7 @@ def query_bodies(
     rows, device = len(points), points.device
     distance, closest = allocate((rows,), torch.float32, device), allocate((rows, 3), torch.float32, device)
     face, barycentric = allocate((rows,), torch.int32, device), allocate((rows, 3), torch.float32, device)
+    clear = distance[:0] if clear is None else clear
     if rows:
         with torch_stream(device) as warp_device:
             launch_rows(
@@ -218,6 +206,7 @@ def query_bodies(
                     as_argument(points, wp.vec3),
                     as_argument(body_of_point, wp.int32),
                     as_argument(within, wp.float32),
+                    as_argument(clear, wp.float32),
                 ],
                 outputs=[
                     as_argument(distance, wp.float32),

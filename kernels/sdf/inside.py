@@ -30,13 +30,15 @@ import warp as wp
 
 from warpgarment.kernels import compiling
 
+from .model import Bodies
+
 wp.set_module_options(compiling.options())
 
 MOST_CAPS = 512
 """Largest number of caps of a body that are searched one by one."""
 FAR = wp.constant(1.0e30)
 ZERO = wp.constant(wp.float64(0.0))
-NEGLIGIBLE = wp.constant(wp.float64(0.2))  # a loop whose winding number is below this is at first only bounded
+NEGLIGIBLE = wp.constant(0.2)  # a loop whose winding number is below this is at first only bounded
 ROUNDING = wp.constant(wp.float64(1.0e-6))  # rounding error of a sum of solid angles
 PER_TURN = wp.constant(wp.float64(1.0 / (4.0 * np.pi)))
 
@@ -114,15 +116,7 @@ def winding_of(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, volume: wp.float64):
 
 @wp.func
 def loop_winding(
-    vertices: wp.array[wp.vec3],
-    caps: wp.array[wp.vec3i],
-    first: int,
-    last: int,
-    point: wp.vec3,
-    axis: int,
-    side: float,
-    crossed: bool,
-    seen: bool,
+    bodies: wp.array[Bodies], loop: int, point: wp.vec3, axis: int, side: float, crossed: bool, seen: bool
 ):
     """Crossings of the ray with the caps of a loop, if `crossed`, less the winding number of the caps, if `seen`.
 
@@ -131,8 +125,9 @@ def loop_winding(
     """
     total = ZERO
     p = wp.vec3d(point)
-    for k in range(first, last):
-        cap = caps[k]
+    vertices = bodies[0].vertices
+    for k in range(bodies[0].loops[loop], bodies[0].loops[loop + 1]):
+        cap = bodies[0].caps[k]
         a = wp.vec3d(vertices[cap[0]]) - p
         b = wp.vec3d(vertices[cap[1]]) - p
         c = wp.vec3d(vertices[cap[2]]) - p
@@ -147,55 +142,39 @@ def loop_winding(
 
 
 @wp.func
-def is_inside(
-    crossed: int,
-    vertices: wp.array[wp.vec3],
-    caps: wp.array[wp.vec3i],
-    loops: wp.array[wp.int32],
-    loop_size: wp.array[wp.vec2],
-    first_loop: int,
-    last_loop: int,
-    point: wp.vec3,
-    axis: int,
-    side: float,
-):
+def is_inside(bodies: wp.array[Bodies], b: int, crossed: int, point: wp.vec3, axis: int, side: float):
     """Whether the winding number of a body exceeds one half.
 
     Args:
+        bodies: The bodies.
+        b: The body.
         crossed: Crossings of a ray from the point along an axis with the body.
-        vertices: Packed vertex positions [m], [U].
-        caps: Packed vertex indices of the caps, [K].
-        loops: Index at which the caps of each loop begin, [L + 1].
-        loop_size: Radius of each loop around its centre [m], and area of its caps [m²], [L].
-        first_loop: First loop of the body.
-        last_loop: Loop after the last one of the body.
         point: Position [m].
         axis: Axis of the ray, 0, 1 or 2.
         side: Direction of the ray along the axis, +1 or -1.
     """
     winding = wp.float64(crossed)
-    unsure = ROUNDING
+    unsure = wp.float32(ROUNDING)
+    first_loop = bodies[0].loop_offsets[b]
+    last_loop = bodies[0].loop_offsets[b + 1]
     for loop in range(first_loop, last_loop):
-        first = loops[loop]
-        last = loops[loop + 1]
-        size = loop_size[loop]
-        offset = vertices[caps[first][0]] - point
-        distance = wp.length(offset)
-        beside = distance * distance - offset[axis] * offset[axis]
-        on_ray = beside <= 1.0001 * size[0] * size[0] + 1.0e-6 * distance * distance
-        gap = wp.float64(distance - size[0])
-        bound = wp.float64(size[1]) * PER_TURN
-        seen = not (gap > ZERO and bound < NEGLIGIBLE * gap * gap)
+        size = bodies[0].loop_size[loop]
+        offset = bodies[0].vertices[bodies[0].caps[bodies[0].loops[loop]][0]] - point
+        square = wp.dot(offset, offset)
+        gap = wp.sqrt(square) - size[0]
+        bound = size[1] * wp.float32(PER_TURN)
+        seen = not (gap > 0.0 and bound < NEGLIGIBLE * gap * gap)
         if not seen:
-            unsure += bound / (gap * gap)
+            unsure += 1.00001 * bound / (gap * gap)
+        on_ray = square - offset[axis] * offset[axis] <= 1.0001 * size[0] * size[0] + 1.0e-6 * square
         if on_ray or seen:
-            winding += loop_winding(vertices, caps, first, last, point, axis, side, on_ray, seen)
-    if wp.abs(winding - wp.float64(0.5)) <= unsure and unsure > ROUNDING:
+            winding += loop_winding(bodies, loop, point, axis, side, on_ray, seen)
+    if wp.abs(winding - wp.float64(0.5)) <= wp.float64(unsure) and unsure > wp.float32(ROUNDING):
         for loop in range(first_loop, last_loop):  # the loops that were only bounded decide
-            size = loop_size[loop]
-            gap = wp.float64(wp.length(vertices[caps[loops[loop]][0]] - point) - size[0])
-            if gap > ZERO and wp.float64(size[1]) * PER_TURN < NEGLIGIBLE * gap * gap:
-                winding += loop_winding(vertices, caps, loops[loop], loops[loop + 1], point, axis, side, False, True)
+            size = bodies[0].loop_size[loop]
+            gap = wp.length(bodies[0].vertices[bodies[0].caps[bodies[0].loops[loop]][0]] - point) - size[0]
+            if gap > 0.0 and size[1] * wp.float32(PER_TURN) < NEGLIGIBLE * gap * gap:
+                winding += loop_winding(bodies, loop, point, axis, side, False, True)
     return winding > wp.float64(0.5)
 
 

@@ -26,6 +26,8 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from .model import Bodies, corners_of
+
 PARTS = wp.constant(6)  # parts that a face shares with others: corners 0, 1, 2, and edges 3, 4, 5 that begin there
 INSIDE = wp.constant(6)
 NO_PART = wp.constant(-1)
@@ -59,16 +61,6 @@ def rings_of(faces: np.ndarray) -> np.ndarray:
 
 
 @wp.func
-def corners_of(mesh: wp.uint64, face: int):
-    """The corners of a face in float64."""
-    body = wp.mesh_get(mesh)
-    a = wp.vec3d(body.points[body.indices[3 * face]])
-    b = wp.vec3d(body.points[body.indices[3 * face + 1]])
-    c = wp.vec3d(body.points[body.indices[3 * face + 2]])
-    return a, b, c
-
-
-@wp.func
 def along_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
     """Distance of a point beyond the start and beyond the end of each edge of a triangle, times the edge's length."""
     ab, bc, ca = b - a, c - b, a - c
@@ -94,17 +86,17 @@ def inward_of_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, after: wp.vec3d, beyo
 
 
 @wp.func
-def nearest_part(mesh: wp.uint64, face: int, point: wp.vec3d):
+def nearest_part(bodies: wp.array[Bodies], b: int, face: int, point: wp.vec3d):
     """The part of a face that is nearest to a point, and the part whose faces may be nearer still.
 
     Returns:
         Nearest part, and the edge or corner close to the nearest point, which is the nearest part if there is none.
         Both are NO_PART if the face is a sliver.
     """
-    a, b, c = corners_of(mesh, face)
-    after, beyond = along_edges(a, b, c, point)
-    inward = inward_of_edges(a, b, c, after, beyond)
-    ab, bc, ca = b - a, c - b, a - c
+    p, q, r = corners_of(bodies, b, face)
+    after, beyond = along_edges(p, q, r, point)
+    inward = inward_of_edges(p, q, r, after, beyond)
+    ab, bc, ca = q - p, r - q, p - r
     area = wp.dot(ab, ab) * wp.dot(bc, bc) - wp.dot(ab, bc) * wp.dot(ab, bc)
     size = wp.dot(ab, ab) + wp.dot(bc, bc) + wp.dot(ca, ca)
     if not area > SLIVER * size * size:
@@ -132,11 +124,11 @@ def nearest_part(mesh: wp.uint64, face: int, point: wp.vec3d):
 
 
 @wp.func
-def nearest_on_part(mesh: wp.uint64, face: int, part: int, point: wp.vec3d):
+def nearest_on_part(bodies: wp.array[Bodies], b: int, face: int, part: int, point: wp.vec3d):
     """Barycentric coordinates of the nearest point on a given part of a face, and its squared distance [m²]."""
-    a, b, c = corners_of(mesh, face)
-    after, beyond = along_edges(a, b, c, point)
-    inward = inward_of_edges(a, b, c, after, beyond)
+    p, q, r = corners_of(bodies, b, face)
+    after, beyond = along_edges(p, q, r, point)
+    inward = inward_of_edges(p, q, r, after, beyond)
     weights = wp.vec3d(inward[1], inward[2], inward[0]) / (inward[0] + inward[1] + inward[2])
     for k in range(3):
         if part == k:
@@ -147,7 +139,7 @@ def nearest_on_part(mesh: wp.uint64, face: int, part: int, point: wp.vec3d):
             weights = wp.vec3d()
             weights[k] = wp.float64(1.0) - t
             weights[(k + 1) % 3] = t
-    return weights, wp.length_sq(weights[0] * a + weights[1] * b + weights[2] * c - point)
+    return weights, wp.length_sq(weights[0] * p + weights[1] * q + weights[2] * r - point)
 
 
 @wp.func
@@ -191,39 +183,39 @@ def closest_on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> w
 
 
 @wp.func
-def named_face(mesh: wp.uint64, rings: wp.array2d[wp.int32], first_ring: int, face: int, point: wp.vec3):
+def named_face(bodies: wp.array[Bodies], b: int, face: int, point: wp.vec3):
     """The face that the rule of this module names, starting from a face that a search found.
 
     Args:
-        mesh: The body.
-        rings: Results of `rings_of`, one after the other, [*, 6].
-        first_ring: First row of the body in `rings`.
+        bodies: The bodies.
+        b: The body.
         face: Face that the search found, counted within the body.
         point: Position [m].
     """
     p = wp.vec3d(point)
+    first_ring = bodies[0].ring_offsets[b]
     nearest = wp.int32(face)
-    part, around = nearest_part(mesh, nearest, p)
+    part, around = nearest_part(bodies, b, nearest, p)
     named = wp.int32(face)
     begin = wp.int32(-1)
     # The loop ends, because each round that changes the face comes nearer to the point.
     while around >= 0 and around < PARTS and begin != PARTS * nearest + around:
         begin = PARTS * nearest + around
         named = nearest
-        at = rings[first_ring + nearest, around]
+        at = bodies[0].rings[first_ring + nearest, around]
         while at != begin:
             other = at // PARTS
             shared = at - PARTS * other
-            theirs, _around = nearest_part(mesh, other, p)
+            theirs, _around = nearest_part(bodies, b, other, p)
             if theirs != NO_PART:
                 named = wp.min(named, other)
                 if theirs != shared:
-                    _w, distance = nearest_on_part(mesh, other, theirs, p)
-                    _v, least = nearest_on_part(mesh, nearest, part, p)
+                    _w, distance = nearest_on_part(bodies, b, other, theirs, p)
+                    _v, least = nearest_on_part(bodies, b, nearest, part, p)
                     if distance < least:
                         nearest = other
                         part = theirs
-            at = rings[first_ring + other, shared]
+            at = bodies[0].rings[first_ring + other, shared]
         around = part
     if part == INSIDE:
         named = nearest

@@ -80,7 +80,7 @@ def _signed_distance(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     bodies = BodyMeshes(body_vertices, body_faces)
     body = bodies.body_of("body", None, len(points))
-    result = query_bodies(bodies.model, points, body, torch.full((1,), float("inf"), device=points.device))
+    result = query_bodies(bodies.argument, points, body, torch.full((1,), float("inf"), device=points.device))
     with torch_stream(points.device):
         del bodies  # freed in stream order, after the launch
     return result

@@ -39,9 +39,9 @@ from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows,
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import BEYOND, SEARCHES, Bodies, closest_on_body, has_tree
+from .closest import BEYOND, ROUNDING, SEARCHES, closest_on_body
+from .model import Bodies, exists, has_tree
 from .nearest_face import closest_on_triangle
-from .tree import Tree
 from .tree_boxes import boxes_in_box, triangles_above
 from .tree_search import least, least_above, stack64
 
@@ -51,12 +51,21 @@ STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""
 ROOM = wp.constant(0.01001)
 """Margin of the box around a face in which its tips are [m], a little more than l."""
-ROUNDING = wp.constant(2.0e-6)
-"""Lengths [m] that are in a ball by less than this are examined."""
 COVERED = wp.constant(0.57736)
 """1/√3, and some rounding."""
-MOVED = wp.constant(0.1)
+MOVED = wp.constant(0.25)
 """Part of its ball by which a vertex may have moved since it was measured."""
+
+
+class Measured(NamedTuple):
+    """What is known of vertices, on bodies that have not moved since."""
+
+    positions: torch.Tensor
+    """Where they were measured [m], float32 [V,3]."""
+    depth: torch.Tensor
+    """Depth of each vertex [m], float32 [V]."""
+    clear: torch.Tensor
+    """Radius of the ball around each vertex that holds no surface [m], float32 [V]."""
 
 
 class SurfaceDepth(NamedTuple):
@@ -69,7 +78,7 @@ class SurfaceDepth(NamedTuple):
 
 
 @wp.func
-def depth_at(bodies: Bodies, b: int, point: wp.vec3) -> float:
+def depth_at(bodies: wp.array[Bodies], b: int, point: wp.vec3) -> float:
     """Depth of a point inside a body [m]; 0 outside."""
     depth = wp.float32(0.0)
     _face, sign, _weights, closest = closest_on_body(bodies, b, point, 0.0)
@@ -97,8 +106,11 @@ def foot_of_tips(
 
 
 @wp.func
-def foot_by_tree(tree: Tree, b: int, x: wp.vec3, y: wp.vec3, z: wp.vec3, normal: wp.vec3, low: wp.vec3, high: wp.vec3):
+def foot_by_tree(
+    bodies: wp.array[Bodies], b: int, x: wp.vec3, y: wp.vec3, z: wp.vec3, normal: wp.vec3, low: wp.vec3, high: wp.vec3
+):
     """The point c of a face of the garment; the body's faces are searched in the trees of tree.py."""
+    tree = bodies[0].tree
     most = wp.float32(0.0)
     foot = wp.vec3(wp.nan)
     thick = STANDS_OUT * wp.length(normal)
@@ -133,7 +145,7 @@ def foot_by_tree(tree: Tree, b: int, x: wp.vec3, y: wp.vec3, z: wp.vec3, normal:
 def feet_of_tips(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     faces: wp.array[wp.vec3i],
     # In:
     vertices: wp.array[wp.vec3],
@@ -149,7 +161,7 @@ def feet_of_tips(
     i = from_row + wp.tid()
     feet[i] = wp.vec3(wp.nan)
     b = body_of_vertex[faces[i][0]]
-    if b < 0 or b >= bodies.meshes.shape[0]:
+    if not exists(bodies, b):
         return
     x = vertices[faces[i][0]]
     y = vertices[faces[i][1]]
@@ -164,22 +176,22 @@ def feet_of_tips(
     low = wp.min(x, wp.min(y, z)) - room
     high = wp.max(x, wp.max(y, z)) + room
     if has_tree(bodies):
-        feet[i] = foot_by_tree(bodies.tree, b, x, y, z, normal, low, high)
+        feet[i] = foot_by_tree(bodies, b, x, y, z, normal, low, high)
         return
-    query = wp.mesh_query_aabb(bodies.meshes[b], low, high)
+    query = wp.mesh_query_aabb(bodies[0].meshes[b], low, high)
     face = wp.int32(0)
     most = wp.float32(0.0)
     foot = wp.vec3(wp.nan)
     while wp.mesh_query_aabb_next(query, face):
-        corner = bodies.faces[face + bodies.face_offsets[b]]
+        corner = bodies[0].faces[face + bodies[0].face_offsets[b]]
         most, foot = foot_of_tips(
             x,
             y,
             z,
             normal,
-            bodies.vertices[corner[0]],
-            bodies.vertices[corner[1]],
-            bodies.vertices[corner[2]],
+            bodies[0].vertices[corner[0]],
+            bodies[0].vertices[corner[1]],
+            bodies[0].vertices[corner[2]],
             most,
             foot,
         )
@@ -190,7 +202,7 @@ def feet_of_tips(
 def depth_of_vertices(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     # In:
     vertices: wp.array[wp.vec3],
     body_of_vertex: wp.array[wp.int32],
@@ -206,7 +218,7 @@ def depth_of_vertices(
     depth[i] = 0.0
     clear[i] = 0.0
     b = body_of_vertex[i]
-    if b >= 0 and b < bodies.meshes.shape[0]:
+    if exists(bodies, b):
         if measured.shape[0] > 0:
             moved = wp.length(vertices[i] - measured[i])
             if moved == 0.0:
@@ -226,20 +238,24 @@ def depth_of_vertices(
 
 
 @wp.func
+def in_ball(point: wp.vec3, centre: wp.vec3, radius: float) -> bool:
+    """Whether a point is in a ball without surface."""
+    away = point - centre
+    inner = wp.max(radius - ROUNDING, 0.0)
+    return wp.dot(away, away) < inner * inner
+
+
+@wp.func
 def in_a_ball(point: wp.vec3, x: wp.vec3, y: wp.vec3, z: wp.vec3, radius: wp.vec3) -> bool:
     """Whether a point is in the ball without surface around a corner."""
-    return (
-        wp.length(point - x) + ROUNDING < radius[0]
-        or wp.length(point - y) + ROUNDING < radius[1]
-        or wp.length(point - z) + ROUNDING < radius[2]
-    )
+    return in_ball(point, x, radius[0]) or in_ball(point, y, radius[1]) or in_ball(point, z, radius[2])
 
 
 @wp.kernel(enable_backward=False, module=SEARCHES)
 def depth_between_vertices(
     from_row: wp.int32,
     # Model:
-    bodies: Bodies,
+    bodies: wp.array[Bodies],
     edges: wp.array[wp.vec2i],
     faces: wp.array[wp.vec3i],
     # In:
@@ -260,7 +276,7 @@ def depth_between_vertices(
         corner = wp.vec3i(edges[i][0], edges[i][1], edges[i][1])
     between[i] = 0.0
     b = body_of_vertex[corner[0]]
-    if b < 0 or b >= bodies.meshes.shape[0]:
+    if not exists(bodies, b):
         return
     x = vertices[corner[0]]
     y = vertices[corner[1]]
@@ -271,7 +287,7 @@ def depth_between_vertices(
     if is_face:
         middle = (x + y + z) / 3.0
         foot = feet[i - edges.shape[0]]
-        if not in_a_ball(foot, x, y, z, radius):
+        if not (wp.isnan(foot[0]) or in_a_ball(foot, x, y, z, radius)):
             worst = depth_at(bodies, b, foot)
     if not in_a_ball(middle, x, y, z, radius):
         worst = wp.max(worst, depth_at(bodies, b, middle))
@@ -312,6 +328,45 @@ def collect_depth(
             wp.atomic_max(missing, corner[k], more)
 
 
+def measured(
+    vertices: torch.Tensor,
+    bodies: BodyMeshes,
+    body_of_vertex: torch.Tensor,
+    *,
+    limit: float = 0.0,
+    before: Measured | None = None,
+) -> Measured:
+    """Depths of vertices, and the balls around those that are outside; without gradients.
+
+    Args:
+        vertices: Positions [m], float32 [V,3]; vertices that are not finite count as outside, without a ball.
+        bodies: The bodies at the same time step.
+        body_of_vertex: Body of each vertex, int32 [V]; a vertex with body -1 is in no body.
+        limit: Largest radius of a ball that is looked for [m].
+        before: What was found of the same vertices earlier, on the bodies where they are now, with the same
+            `body_of_vertex` or more of them on a body. Balls of vertices that hardly moved are then smaller by that.
+
+    Raises:
+        ValueError: Wrong shape or device.
+        TypeError: Wrong dtype.
+    """
+    device, size = vertices.device, len(vertices)
+    expect("vertices", vertices, (None, 3))
+    expect("body_of_vertex", body_of_vertex, (size,), torch.int32, device)
+    vertices = vertices.detach()
+    depth, clear = allocate((2, size), torch.float32, device)
+    earlier = Measured(depth.new_empty((0, 3)), depth[:0], depth[:0]) if before is None else before
+    if before is not None:
+        expect("before.positions", before.positions, (size, 3), device=device)
+    with torch_stream(device) as warp_device:
+        points, body = as_argument(vertices, wp.vec3), as_argument(body_of_vertex, wp.int32)
+        inputs = [bodies.argument, points, body, float(limit), as_argument(earlier.positions, wp.vec3)]
+        inputs += [as_argument(earlier.depth, wp.float32), as_argument(earlier.clear, wp.float32)]
+        found = [as_argument(depth, wp.float32), as_argument(clear, wp.float32)]
+        launch_rows(depth_of_vertices, size, inputs, found, warp_device)
+    return Measured(vertices, depth, clear)
+
+
 def surface_depth(
     vertices: torch.Tensor,
     bodies: BodyMeshes,
@@ -322,7 +377,7 @@ def surface_depth(
     count: int,
     *,
     limit: float = 0.0,
-    before: tuple[torch.Tensor, SurfaceDepth] | None = None,
+    before: Measured | None = None,
 ) -> SurfaceDepth:
     """Depths of a packed batch of garments; without gradients.
 
@@ -336,8 +391,7 @@ def surface_depth(
         count: Number of garments B.
         limit: Largest distance of vertices that is looked for [m], to leave out what is around them. It changes the
             time only; a little more than half of an edge is a good one.
-        before: Positions [V,3] at which the same vertices were measured before on the bodies where they are now, with
-            the same `body_of_vertex` or more of them on a body, and what was found. It changes the time only.
+        before: What `measured` found of the same vertices earlier. It changes the time only.
 
     Raises:
         ValueError: Wrong shape or device.
@@ -347,30 +401,19 @@ def surface_depth(
     expect("vertices", vertices, (None, 3))
     expect("edges", edges, (None, 2), torch.int32, device)
     expect("faces", faces, (None, 3), torch.int32, device)
-    for name, tensor in (("body_of_vertex", body_of_vertex), ("garment_of_vertex", garment_of_vertex)):
-        expect(name, tensor, (size,), torch.int32, device)
-    depth, clear = allocate((2, size), torch.float32, device)
+    expect("garment_of_vertex", garment_of_vertex, (size,), torch.int32, device)
+    now = measured(vertices, bodies, body_of_vertex, limit=limit, before=before)
     feet, between = (allocate(shape, torch.float32, device) for shape in ((len(faces), 3), (len(edges) + len(faces),)))
     missing, deepest = (torch.zeros(length, dtype=torch.float32, device=device) for length in (size, count))
-    points, body = as_argument(vertices.detach(), wp.vec3), as_argument(body_of_vertex, wp.int32)
+    points, body = as_argument(now.positions, wp.vec3), as_argument(body_of_vertex, wp.int32)
     lines, triangles = as_argument(edges, wp.vec2i), as_argument(faces, wp.vec3i)
-    foot, depths, rest = (as_argument(feet, wp.vec3), *(as_argument(t, wp.float32) for t in (depth, between)))
-    balls = as_argument(clear, wp.float32)
-    measured = (depth.new_empty((0, 3)), depth[:0], depth[:0])
-    if before is not None:
-        expect("measured positions", before[0], (size, 3), device=device)
-        measured = (before[0].detach(), before[1].depth, before[1].clear)
-    earlier = [
-        as_argument(values, kind) for values, kind in zip(measured, (wp.vec3, wp.float32, wp.float32), strict=True)
-    ]
+    foot, depths, rest = (as_argument(feet, wp.vec3), *(as_argument(t, wp.float32) for t in (now.depth, between)))
+    balls = as_argument(now.clear, wp.float32)
     with torch_stream(device) as warp_device:
-        found = [depths, balls]
-        inputs = [bodies.model, points, body, float(limit), *earlier]
-        launch_rows(depth_of_vertices, size, inputs, found, warp_device)
-        launch_rows(feet_of_tips, len(faces), [bodies.model, triangles, points, body, balls], [foot], warp_device)
-        inputs = [bodies.model, lines, triangles, points, body, balls, foot]
+        launch_rows(feet_of_tips, len(faces), [bodies.argument, triangles, points, body, balls], [foot], warp_device)
+        inputs = [bodies.argument, lines, triangles, points, body, balls, foot]
         launch_rows(depth_between_vertices, len(between), inputs, [rest], warp_device)
         given = [as_argument(garment_of_vertex, wp.int32), lines, triangles, depths, rest]
         written = [as_argument(missing, wp.float32), as_argument(deepest, wp.float32)]
         launch(collect_depth, size + len(between), [*given, *written], warp_device)
-    return SurfaceDepth(deepest, missing, depth, clear)
+    return SurfaceDepth(deepest, missing, now.depth, now.clear)

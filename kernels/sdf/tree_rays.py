@@ -8,7 +8,8 @@ from __future__ import annotations
 import warp as wp
 
 from .inside import crossing, volume_of
-from .tree import Tree, vec8, vec8i
+from .model import Bodies
+from .tree import vec8, vec8i
 from .tree_search import NEVER, least, least_above, stack64
 
 
@@ -99,8 +100,9 @@ def crossings_in_leaf(corners: wp.array2d[vec8], leaf: int, point: wp.vec3, axis
 
 
 @wp.func
-def crossings_by_tree(tree: Tree, b: int, point: wp.vec3, axis: int, side: float) -> int:
+def crossings_by_tree(bodies: wp.array[Bodies], b: int, point: wp.vec3, axis: int, side: float) -> int:
     """Signed number of crossings of a ray with a body, as `inside.crossings`."""
+    tree = bodies[0].tree
     pu = point[(axis + 1) % 3]
     pv = point[(axis + 2) % 3]
     along = point[axis]

@@ -12,26 +12,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from .tree import FAR, Tree, vec8, vec8i
+from .model import Bodies
+from .tree import FAR, vec8, vec8i
 
 NEVER = wp.constant(0x7FFFFFFF)
 LANE = wp.constant(7)
 """The bits of a key that are a lane."""
 stack64 = wp.types.vector(length=64, dtype=wp.int32)  # seven for each level, which is enough for eight levels
-
-_ON_CPU = """
-#if defined(__CUDA_ARCH__)
-    return 0;
-#else
-    return 1;
-#endif
-"""
-
-
-@wp.func_native(_ON_CPU)
-def on_cpu() -> int:
-    """1 where kernels are compiled for a CPU. On a GPU the compiler leaves out what depends on it."""
-    ...
 
 
 @wp.func
@@ -186,12 +173,13 @@ def distances_to_triangles(frames: wp.array2d[vec8], leaf: int, px: float, py: f
 
 
 @wp.func
-def nearest_by_tree(tree: Tree, b: int, point: wp.vec3, reach: float) -> int:
+def nearest_by_tree(bodies: wp.array[Bodies], b: int, point: wp.vec3, reach: float) -> int:
     """The face of a body, counted within it, that is nearest to a point; -1 if none is nearer than `reach` [m].
 
     Nodes are kept on a stack, the nearest on top, and children of the last level are looked at in the order of their
     distance, up to the least distance that was found so far.
     """
+    tree = bodies[0].tree
     px = point[0]
     py = point[1]
     pz = point[2]
@@ -199,29 +187,32 @@ def nearest_by_tree(tree: Tree, b: int, point: wp.vec3, reach: float) -> int:
     face = wp.int32(-1)
     nodes = stack64()
     bounds = stack64()
-    nodes[0] = tree.nodes[b]
-    top = wp.int32(1)
-    while top > 0:
-        top -= 1
-        if bounds[top] < best:
-            node = nodes[top]
-            keys = distances_to_boxes(tree.boxes, node, px, py, pz)
-            first = tree.children[node]
-            if first < 0:
-                key = least(keys)
-                while key < best:
-                    leaf = ~first + (key & LANE)
-                    bits = distances_to_triangles(tree.frames, leaf, px, py, pz)
-                    found = least(bits)
-                    if found < best:
-                        best = found
-                        face = tree.faces[leaf][lane_of(bits, found)]
-                    key = least_above(keys, key)
-            else:
-                key = most_below(keys, best)
-                while key >= 0:
-                    nodes[top] = first + (key & LANE)
-                    bounds[top] = key & ~LANE
-                    top += 1
-                    key = most_below(keys, key)
+    top = wp.int32(0)
+    node = tree.nodes[b]
+    while node >= 0:
+        keys = distances_to_boxes(tree.boxes, node, px, py, pz)
+        first = tree.children[node]
+        node = wp.int32(-1)
+        near = least(keys)
+        if first < 0:
+            while near < best:
+                leaf = ~first + (near & LANE)
+                bits = distances_to_triangles(tree.frames, leaf, px, py, pz)
+                found = least(bits)
+                if found < best:
+                    best = found
+                    face = tree.faces[leaf][lane_of(bits, found)]
+                near = least_above(keys, near)
+        elif near < best:
+            node = first + (near & LANE)
+            key = most_below(keys, best)
+            while key > near:
+                nodes[top] = first + (key & LANE)
+                bounds[top] = key & ~LANE
+                top += 1
+                key = most_below(keys, key)
+        while node < 0 and top > 0:
+            top -= 1
+            if bounds[top] < best:
+                node = nodes[top]
     return face

@@ -10,7 +10,7 @@ from support.poison import poison_outputs
 from support.scenes import network
 
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.surface_depth import surface_depth
+from warpgarment.kernels.sdf.surface_depth import Measured, surface_depth
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
@@ -118,7 +118,10 @@ def test_what_was_measured_before_changes_nothing(wide, monkeypatch):
         assert torch.equal(found.depth, fresh.depth)
         assert (found.clear <= fresh.clear + 1e-7).all()
         spared += int((found.clear < fresh.clear - 1e-6).sum())
-        before = at, found
+        before = Measured(at, found.depth, found.clear)
+        queried = [bodies.query(at, within=0.01, clear=clear) for clear in (None, found.clear)]
+        for mine, theirs in zip(*queried, strict=True):
+            assert torch.equal(torch.nan_to_num(mine, nan=-9.0), torch.nan_to_num(theirs, nan=-9.0))
     assert spared > 100  # it was used
     assert fresh.garments[0] > 0.002
 

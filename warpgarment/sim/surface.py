@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.surface_depth import SurfaceDepth, surface_depth
+from warpgarment.kernels.sdf.surface_depth import Measured, SurfaceDepth, measured, surface_depth
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
@@ -38,12 +38,16 @@ class Surface:
         length = (one - other).norm(dim=1)
         self._limit = REACH * float(length.mean()) if len(length) else 0.0
 
+    def measured(self, vertices: torch.Tensor, bodies: BodyMeshes, body_of_vertex: torch.Tensor) -> Measured:
+        """Depths of vertices [V,3] alone, and the balls around those that are outside."""
+        return measured(vertices, bodies, body_of_vertex, limit=self._limit)
+
     def depth(
         self,
         vertices: torch.Tensor,
         bodies: BodyMeshes,
         body_of_vertex: torch.Tensor,
-        before: tuple[torch.Tensor, SurfaceDepth] | None = None,
+        before: Measured | None = None,
     ) -> SurfaceDepth:
         """Depth of vertices [V,3], edges and faces in the bodies [m]; `before` is that of `surface_depth`."""
         packed = self._packed

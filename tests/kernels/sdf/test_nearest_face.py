@@ -12,6 +12,7 @@ from support.poison import poison_outputs
 from warpgarment.kernels import features, sdf
 from warpgarment.kernels.sdf import closest
 from warpgarment.kernels.sdf import nearest_face as kernel
+from warpgarment.kernels.sdf.model import Bodies
 
 
 def three_on_an_edge() -> meshes.Mesh:
@@ -69,7 +70,7 @@ def asked(mesh: meshes.Mesh, points: np.ndarray) -> tuple[np.ndarray, ...]:
     """Distance, closest point, face and barycentric coordinates."""
     bodies = sdf.BodyMeshes(torch.tensor(mesh.vertices), torch.tensor(mesh.faces))
     body, within = torch.zeros(len(points), dtype=torch.int32), torch.full((1,), float("inf"))
-    return tuple(t.numpy() for t in closest.query_bodies(bodies.model, torch.tensor(points), body, within))
+    return tuple(t.numpy() for t in closest.query_bodies(bodies.argument, torch.tensor(points), body, within))
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -100,15 +101,14 @@ def test_the_smallest_of_equally_near_faces_is_named(name, monkeypatch):
 
 @wp.kernel(enable_backward=False)
 def name_faces(
-    mesh: wp.uint64,
-    rings: wp.array2d[wp.int32],
+    bodies: wp.array[Bodies],
     found: wp.array[wp.int32],
     points: wp.array[wp.vec3],
     named: wp.array[wp.int32],
 ):
     """What the rule makes of a face that was found."""
     i = wp.tid()
-    named[i] = kernel.named_face(mesh, rings, 0, found[i], points[i])
+    named[i] = kernel.named_face(bodies, 0, found[i], points[i])
 
 
 def test_it_does_not_matter_which_neighbour_was_found():
@@ -125,10 +125,9 @@ def test_it_does_not_matter_which_neighbour_was_found():
     touching = (mesh.faces[:, None, :, None] == mesh.faces[None, :, None, :]).any(axis=(2, 3))
     found, which = touching[:, expected].nonzero()
     assert len(found) > 10 * len(points)
-    warp_mesh = wp.Mesh(wp.array(mesh.vertices, dtype=wp.vec3), wp.array(mesh.faces.ravel(), dtype=wp.int32))
-    rings = wp.array(kernel.rings_of(mesh.faces), dtype=wp.int32)
+    bodies = sdf.BodyMeshes(torch.tensor(mesh.vertices), torch.tensor(mesh.faces))
     named = wp.full(len(found), -99, dtype=wp.int32)
-    inputs = [warp_mesh.id, rings, wp.array(found.astype(np.int32)), wp.array(points[which], dtype=wp.vec3)]
+    inputs = [bodies.argument, wp.array(found.astype(np.int32)), wp.array(points[which], dtype=wp.vec3)]
     wp.launch(name_faces, dim=len(found), inputs=inputs, outputs=[named])
     np.testing.assert_array_equal(named.numpy(), expected[which])
 

@@ -20,7 +20,7 @@ from warpgarment.kernels.features.carry import carried, face_at_each_vertex
 from warpgarment.kernels.replay.pieces import Pieces
 from warpgarment.kernels.replay.recording import recording
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.surface_depth import SurfaceDepth
+from warpgarment.kernels.sdf.surface_depth import Measured
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.bodies import MovingBodies
 from warpgarment.sim.surface import Surface, distance_to_keep
@@ -44,18 +44,18 @@ class Pass(NamedTuple):
     on_body: torch.Tensor  # int32 [V], body of each vertex in the last pass; -1 for none
     epsilon: torch.Tensor  # [V], distance that vertices kept in it [m]
     report: torch.Tensor | None = None  # float64 [3] of the solves; None before the first
-    depth: torch.Tensor | None = None  # [B] of the garments [m]; with what follows None before it is measured
-    at: torch.Tensor | None = None  # [V,3], positions at which it was measured last [m]
+    depth: torch.Tensor | None = None  # [B] of the garments [m]; with `missing` None before it is measured
     missing: torch.Tensor | None = None  # [V], see `SurfaceDepth`
+    at: torch.Tensor | None = None  # [V,3], positions at which vertices were measured last [m]; see `Measured`
     inside: torch.Tensor | None = None  # [V], depth of each vertex there
     clear: torch.Tensor | None = None  # [V], ball around each vertex without surface
 
     @property
-    def measured(self) -> tuple[torch.Tensor, SurfaceDepth] | None:
-        """Where depths were measured last, and what was found."""
-        if self.at is None or self.depth is None or self.missing is None or self.inside is None or self.clear is None:
+    def measured(self) -> Measured | None:
+        """Where vertices were measured last, and what was found."""
+        if self.at is None or self.inside is None or self.clear is None:
             return None
-        return self.at, SurfaceDepth(self.depth, self.missing, self.inside, self.clear)
+        return Measured(self.at, self.inside, self.clear)
 
 
 FIELDS = len(Pass._fields)
@@ -194,7 +194,10 @@ class Contact:
             if not self._all(state.pending):
                 on_body = torch.where(state.pending[self._packed.owner], self._body_of_vertex, -1)
             epsilon = distance_to_keep(epsilon, state.missing, vertices, bodies, on_body)
-        frame = ContactFrame(bodies, on_body, self._packed.garment_of_vertex, epsilon, origin)
+        else:
+            _, inside, clear = self._surface.measured(vertices, bodies, on_body)
+            state = state._replace(at=vertices, inside=inside, clear=clear)
+        frame = ContactFrame(bodies, on_body, self._packed.garment_of_vertex, epsilon, origin, state.clear)
         found = self._contacts(vertices, frame)
         return (state._replace(on_body=on_body, epsilon=epsilon), found.normal, found.anchor, found.distance)
 
