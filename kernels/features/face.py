@@ -65,14 +65,29 @@ class BodyInteraction(NamedTuple):
 
 
 @wp.func
-def frame_or_zero(a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Q = [e1, e2, n] in float64; zero where the triangle is a sliver or not finite."""
-    e1 = wp.vec3d(b) - wp.vec3d(a)
-    e2 = wp.vec3d(c) - wp.vec3d(a)
+def has_area(area: wp.vec3d, e1: wp.vec3d, e2: wp.vec3d) -> bool:
+    """Whether a triangle with these edges and their cross product is finite and no sliver."""
+    return wp.length(area) > SLIVER * wp.max(wp.dot(e1, e1), wp.dot(e2, e2))
+
+
+@wp.func
+def motion_of(a0: wp.vec3, a1: wp.vec3, a2: wp.vec3, b0: wp.vec3, b1: wp.vec3, b2: wp.vec3) -> wp.mat33:
+    """D = Q_next Q⁻¹ of a triangle a that moves to b, Q = [e1, e2, n], in float64; the identity for slivers.
+
+    The rows of Q⁻¹ are e2 × m / m², m × e1 / m² and n, with m = e1 × e2 and n = m / |m|.
+    """
+    e1 = wp.vec3d(a1) - wp.vec3d(a0)
+    e2 = wp.vec3d(a2) - wp.vec3d(a0)
+    f1 = wp.vec3d(b1) - wp.vec3d(b0)
+    f2 = wp.vec3d(b2) - wp.vec3d(b0)
     area = wp.cross(e1, e2)
-    if not wp.length(area) > SLIVER * wp.max(wp.dot(e1, e1), wp.dot(e2, e2)):
-        return wp.mat33d()
-    return wp.matrix_from_cols(e1, e2, wp.normalize(area))
+    next_area = wp.cross(f1, f2)
+    if not (has_area(area, e1, e2) and has_area(next_area, f1, f2)):
+        return wp.identity(n=3, dtype=wp.float32)
+    square = wp.dot(area, area)
+    turned = next_area / wp.sqrt(square * wp.dot(next_area, next_area))
+    rows = wp.outer(f1, wp.cross(e2, area) / square) + wp.outer(f2, wp.cross(area, e1) / square)
+    return wp.mat33(rows + wp.outer(turned, area))
 
 
 @wp.func
@@ -94,10 +109,7 @@ def nearest_motion(bodies: wp.array[Bodies], b: int, point: wp.vec3, next_vertic
             a0, a1, a2 = at[corner[0]], at[corner[1]], at[corner[2]]
             b0, b1, b2 = next_vertices[corner[0]], next_vertices[corner[1]], next_vertices[corner[2]]
             velocity = ((b0 - a0) + (b1 - a1) + (b2 - a2)) / 3.0
-            q = frame_or_zero(a0, a1, a2)
-            q_next = frame_or_zero(b0, b1, b2)
-            if wp.determinant(q) > wp.float64(0.0) and wp.determinant(q_next) > wp.float64(0.0):
-                deformation = wp.mat33(q_next * wp.inverse(q))
+            deformation = motion_of(a0, a1, a2, b0, b1, b2)
     return closest, sign, face, deformation, velocity
 
 
