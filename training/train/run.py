@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import gc
 import json
@@ -15,6 +16,7 @@ import torch
 from tqdm import tqdm
 
 from warpgarment.io.npz import write_npz
+from warpgarment.kernels.threads import torch_on_one
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.faces.grow import untrained
@@ -86,6 +88,7 @@ class Run:
             chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
             ahead = 0  # the solvers of a scene must stay in one thread
         self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
+        self.shares_threads = network.shares_threads and self.device.type == "cpu"  # see kernels/threads.py
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
@@ -224,10 +227,11 @@ class Run:
         self.optimizer.zero_grad(set_to_none=True)
         if isinstance(self.objective, PositionObjective):
             self.objective.progress = self.progress(self.step)
-        losses = self.trainer.backward(batch)
-        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip, foreach=True)
-        self.optimizer.step()
-        self.average.update(network)
+        with torch_on_one() if self.shares_threads else contextlib.nullcontext():
+            losses = self.trainer.backward(batch)
+            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip, foreach=True)
+            self.optimizer.step()
+            self.average.update(network)
         self.unread.append(torch.cat([losses, norm.detach()[None]]))
         self.rate.count(*batch.work(network.config))
 
