@@ -88,7 +88,6 @@ class Run:
             chosen = UnrolledBuilder(builder.sequences, network, config.noise, config.augmentation, steps, passes)
             ahead = 0  # the solvers of a scene must stay in one thread
         self.loader = Loader(chosen, plan, self.pool, config.pushforward.share, self.splits, ahead, part)
-        self.shares_threads = network.shares_threads and self.device.type == "cpu"  # see kernels/threads.py
         self.average = training_state.Average(network, config.average)
         self.optimizer = torch.optim.AdamW(
             network.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
@@ -185,6 +184,11 @@ class Run:
 
     def loop(self) -> None:
         """Trains until the run is over."""
+        shares = self.network.shares_threads and self.device.type == "cpu"
+        with torch_on_one() if shares else contextlib.nullcontext():
+            self._loop()
+
+    def _loop(self) -> None:
         config = self.config
         last = config.steps if config.steps is not None else 2**31
         hidden = not self.group.first
@@ -197,6 +201,7 @@ class Run:
             self.rate.go()
             for batch in self.loader.batches(self.step, until):
                 self.update(batch)
+                del batch  # the next one may take over its scene
                 self.step += 1
                 if not settled:  # all is loaded that later collections of garbage need not look at
                     gc.freeze()
@@ -227,11 +232,10 @@ class Run:
         self.optimizer.zero_grad(set_to_none=True)
         if isinstance(self.objective, PositionObjective):
             self.objective.progress = self.progress(self.step)
-        with torch_on_one() if self.shares_threads else contextlib.nullcontext():
-            losses = self.trainer.backward(batch)
-            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip, foreach=True)
-            self.optimizer.step()
-            self.average.update(network)
+        losses = self.trainer.backward(batch)
+        norm = torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip, foreach=True)
+        self.optimizer.step()
+        self.average.update(network)
         self.unread.append(torch.cat([losses, norm.detach()[None]]))
         self.rate.count(*batch.work(network.config))
 
