@@ -31,7 +31,8 @@ class _Embed(torch.autograd.Function):
     def forward(
         ctx: Any, rows: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, *live: torch.Tensor
     ) -> torch.Tensor:
-        ctx.save_for_backward(rows, weight)
+        ctx.save_for_backward(weight)
+        ctx.rows = rows  # not as a tensor that must not change: frames after these may be written beside them
         ctx.widths = [frame.shape[-1] for frame in live]
         if _spread(rows):
             return blocks.linear(rows, weight, bias)
@@ -42,7 +43,7 @@ class _Embed(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        rows, weight = ctx.saved_tensors
+        (weight,), rows = ctx.saved_tensors, ctx.rows
         last = weight[..., weight.shape[-1] - sum(ctx.widths) :]
         if _spread(rows):
             of_weight, found = _by_blocks(gradient, rows, weight, last)
