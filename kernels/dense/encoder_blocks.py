@@ -1,6 +1,6 @@
-"""What a thread of trained_tokens.py does, in C++ with the products of plain.py: the encoder on the patches of a row.
+"""What a thread of trained_encoder.py does, in C++ with the products of plain.py: the encoder on the patches of a row.
 
-Symbols are those of tokens.py; arrays of a row begin at the places that `Places` gives, in numbers.
+Symbols are those of tokens.py.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ SIZES = """
     struct Rows {
         static void fill(float* c, int rows, int columns, const float* x) {
             for (int i = 0; i < rows; i++)
-                for (int j = 0; j < columns; j += 16) Vector::store(c + (long)i * columns + j, x ? Vector::load(x + j) : v16{});
+                for (int j = 0; j < columns; j += 16)
+                    Vector::store(c + (long)i * columns + j, x ? Vector::load(x + j) : v16{});
         }
         static void turn(const float* x, long ldx, int rows, int columns, float* y, int ldy) {
             for (int j = 0; j < columns; j++)
@@ -47,7 +48,7 @@ SIZES = """
                 Vector::store(y + j, Vector::fma(Vector::all(weight), Vector::load(x + j), Vector::load(y + j)));
         }
     };
-    // what the forward pass keeps of a row: see `kept_places`
+    // what the forward pass keeps of a row: see `places` of trained_encoder.py
     const long TE = (long)T * E, TQ = (long)T * Q, TH = (long)T * H, PROBABLE = D ? (long)(L / D) * T * Tp : 0;
     const long LAYER = 3 * TE + TQ + PROBABLE + 2 * TH + 2 * T;
     const long KEPT = (long)P * (F + E) + (long)C * (F + E + 1) + layers * LAYER;
@@ -57,7 +58,7 @@ SIZES = """
     float* const last = change + (long)P * E;          // n(x) of velocities at the end [C,E]
     float* const last_scale = last + (long)C * E;      // [C]
     float* const of_layers = last_scale + C;
-    // gradients of a row, of which those of weights are made: see `found_places`
+    // gradients of a row, of which those of weights are made: see `found_places` there
     const long FOUND_LAYER = TQ + 2 * TE + TH;
     // weights
     const long WEIGHTS = 2l * (Q * E + E * E + 2 * H * E), BIASES = Q + 2 * E + H;
@@ -248,7 +249,8 @@ BACKWARD = source(
         __builtin_memcpy(d_contract, x, 4 * TE);
         Rows::fill(d_h, T, H, nullptr);
         Plain::times(x, E, T, of_contract, H, E, H, d_h, H);
-        for (long i = 0; i < TH; i += 16) Vector::store(d_h + i, Vector::load(d_h + i) * Vector::slope(Vector::load(h + i)));
+        for (long i = 0; i < TH; i += 16)
+            Vector::store(d_h + i, Vector::load(d_h + i) * Vector::slope(Vector::load(h + i)));
         Rows::fill(d_n, T, E, nullptr);
         Plain::times(d_h, H, T, of_expand, E, H, E, d_n, E);
         Rows::back(d_n, n2, s2, T, E, x);
@@ -267,7 +269,8 @@ BACKWARD = source(
                 v16 sum = {};
                 for (int j = 0; j < Tp; j += 16) sum = Vector::fma(Vector::load(one + j), Vector::load(d + j), sum);
                 const v16 mean = Vector::all(Vector::total(sum));
-                for (int j = 0; j < Tp; j += 16) Vector::store(d + j, Vector::load(one + j) * (Vector::load(d + j) - mean));
+                for (int j = 0; j < Tp; j += 16)
+                    Vector::store(d + j, Vector::load(one + j) * (Vector::load(d + j) - mean));
             }
             Plain::times(d_p, Tp, T, keys + L + k * D, Q, T, D, d_keys + k * D, Q);
             Plain::outer(d_p, Tp, T, keys + k * D, Q, T, D, d_keys + L + k * D, Q);

@@ -6,8 +6,8 @@ With n(x) = (x - mean) / deviation over the numbers of a face, and m the mean of
     dh = gelu'(h) * V^T dy,   dW = sum dh [n, m]^T,   db = sum dh,   dV = sum dy gelu(h)^T,   dc = sum dy
     dx = dy + n'(x)^T (the part of n in W^T dh, and a third of the part of m at each face that hears this one)
 
-The scale and shift of the layer norm belong to W and b: see `warpgarment/nn/patches/trained.py`. Gradients of weights are
-added up by calls of their own, since nothing that follows in a graph waits for them.
+The scale and shift of the layer norm belong to W and b: see `warpgarment/nn/patches/trained.py`. Gradients of
+weights are added up by calls of their own, since nothing that follows in a graph waits for them.
 """
 
 from __future__ import annotations

@@ -12,8 +12,9 @@ from .products import source
 
 HEARD = """
 struct Heard {
-    // rows of [own, mean of own over three neighbours], or of the mean alone; zeros after `many` rows
-    static inline void mean(const float* own, const wp::int64* side, long from, int many, int width, float* to, int wide) {
+    // the mean of own over three neighbours of each face
+    static inline void mean(const float* own, const wp::int64* side, long from, int many, int width, float* to,
+                            int wide) {
         for (int i = 0; i < many; i++)
             for (int j = 0; j < width; j += 16) {
                 v16 sum = {};
@@ -21,12 +22,15 @@ struct Heard {
                 Vector::store(to + (long)i * wide + j, sum * Vector::all(1.0f / 3.0f));
             }
     }
+    // rows of [own, mean], 32 of them, with zeros after the first `many`
     static inline void rows(const float* own, const wp::int64* side, long from, int many, int width, int hears,
                             float* to) {
         const int wide = hears ? 2 * width : width;
         for (int i = 0; i < 32; i++)
-            for (int j = 0; j < wide; j += 16)
-                Vector::store(to + i * wide + j, i < many && j < width ? Vector::load(own + (from + i) * width + j) : v16{});
+            for (int j = 0; j < wide; j += 16) {
+                v16 x = i < many && j < width ? Vector::load(own + (from + i) * width + j) : v16{};
+                Vector::store(to + i * wide + j, x);
+            }
         if (hears) mean(own, side, from, many, width, to + width, wide);
     }
 };
@@ -148,8 +152,10 @@ def slope_block(
         const float* g = gradient.data + from * width;
         const float* s = slopes.data + from * hidden;
         for (int i = 0; i < many; i++) {
-            for (int j = 0; j < width; j += 16)
-                Vector::store(of_contract_bias + j, Vector::load(of_contract_bias + j) + Vector::load(g + i * width + j));
+            for (int j = 0; j < width; j += 16) {
+                v16 sum = Vector::load(of_contract_bias + j) + Vector::load(g + i * width + j);
+                Vector::store(of_contract_bias + j, sum);
+            }
             for (int j = 0; j < hidden; j += 16)
                 Vector::store(of_expand_bias + j, Vector::load(of_expand_bias + j) + Vector::load(s + i * hidden + j));
         }

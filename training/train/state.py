@@ -33,7 +33,8 @@ class Average:
     def __init__(self, network: GarmentNetwork, decay: float) -> None:
         self.network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay, self.updates = decay, 0
-        self._mine, self._buffers = list(self.network.parameters()), list(self.network.buffers())
+        self._mine: list[torch.Tensor] = list(self.network.parameters())
+        self._buffers = list(self.network.buffers())
 
     @torch.no_grad()
     def update(self, network: torch.nn.Module) -> None:

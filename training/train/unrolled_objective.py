@@ -179,6 +179,7 @@ class UnrolledObjective(nn.Module):
         stacks = Stacks() if overlap else History.stacked
         for k, recorded in enumerate(batch.recorded):
             stacked = stacks(history, features.detach())
+            assert isinstance(stacked, torch.Tensor)  # such stacks are not apart
             live = [*live, features][-config.history :] if features.requires_grad else live
             newest = context(features, scene.packed.face_component, scene.packed.component_count)
             target = targets(self._wanted(batch, vertices, features, k), newest, residual=config.residual)

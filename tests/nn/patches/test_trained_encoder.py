@@ -7,8 +7,8 @@ import copy
 import numpy as np
 import pytest
 import torch
-
 from support import meshes
+
 from warpgarment.kernels.dense import products
 from warpgarment.kernels.dense import trained_encoder as kernels
 from warpgarment.nn.config import NetworkConfig
@@ -64,7 +64,7 @@ def names(network: PatchTransformer) -> list[str]:
 @pytest.mark.parametrize("manifold", [0, 2, 4])
 @pytest.mark.parametrize(("sizes", "rows"), [([9], 1), ([9], 3), ([12, 7], 2)])
 def test_gradients_are_those_of_the_encoder(manifold, sizes, rows):
-    """A head would read the keys of another, patches of padding be attended to, or a weight get the gradient of another.
+    """A head would read the keys of another, patches of padding be attended to, or a weight get another's gradient.
     1e-5 of the norm of each: kernels are up to 1.1e-6 off, torch's float32 5e-7."""
     network, layout = network_of(manifold_heads=manifold), layout_of(sizes)
     assert trained_encoder.fits(network, torch.zeros(rows, 1, 128), layout)

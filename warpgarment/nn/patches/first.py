@@ -60,7 +60,7 @@ def _spread(rows: torch.Tensor) -> bool:
 def _by_blocks(
     gradient: torch.Tensor, rows: torch.Tensor, weight: torch.Tensor, last: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The products of the gradient on several threads: those with the rows [R,O,I], and with the last weights [R,N,K]."""
+    """The products of the gradient on several threads: with the rows [R,O,I], and with the last weights [R,N,K]."""
     of_weight = torch.empty((len(rows), *weight.shape[1:]))
     found = torch.empty((*rows.shape[:2], last.shape[-1]))
     calls = []

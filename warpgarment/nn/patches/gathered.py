@@ -1,8 +1,8 @@
 """Gradients of weights that are used several times in a graph: added up in one place, while the gradient goes on.
 
 The gradient of a step of unrolled training goes back through each layer once for every frame. The gradients of the
-layer's weights are sums over all frames that nothing else waits for, so they are calls of a `threads.Aside`: they run on
-threads that have nothing else to do, in the order of the frames. A layer's function reads a `token` [], which is a
+layer's weights are sums over all frames that nothing else waits for, so they are calls of a `threads.Aside`: they run
+on threads that have nothing else to do, in the order of the frames. A layer's function reads a `token` [], which is a
 function of all its weights; the gradient of the token is asked for after those of all frames, and then the sums are
 finished and become the gradients of the weights.
 """

@@ -119,10 +119,10 @@ def _pack(network: PatchTransformer) -> tuple[kernels.Weights, torch.Tensor]:
     shape = _shape(network)
     root = torch.ones(shape.columns)
     root[: shape.learned] = shape.head**-0.5
-    unused = network.layers[0].attention.qkv.out_features - shape.columns if shape.layers else 0  # type: ignore[union-attr]
     matrices, biases = [], []
     for layer in cast("list[EncoderLayer]", network.layers):
         qkv, out = layer.attention.qkv, layer.attention.out
+        unused = len(qkv.weight) - shape.columns
         weight, bias = folded(layer.attention_norm, qkv.weight[unused:], qkv.bias[unused:])
         expand, expand_bias = folded(layer.feed_forward_norm, layer.expand.weight, layer.expand.bias)
         matrices += [weight * root[:, None], out.weight, expand, layer.contract.weight]
@@ -141,10 +141,10 @@ def _unfolded(
     """Gradients of the parameters from those of the weights of the kernels."""
     slopes: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
     at = 0
-    for name, rows, columns, bias in kernels.sums_of(shape).lengths:
+    for name, rows, columns, biased in kernels.sums_of(shape).lengths:
         end = at + rows * columns
-        slopes[name] = sums[at:end].view(rows, columns), sums[end : end + rows * bias]
-        at = end + rows * bias
+        slopes[name] = sums[at:end].view(rows, columns), sums[end : end + rows * biased]
+        at = end + rows * biased
     found: list[torch.Tensor] = []
     for n in range(shape.layers):
         scale, shift, qkv, _, _, _, between, offset, expand, *_ = parameters[12 * n :]
