@@ -7,13 +7,15 @@ and out without copies.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, TypeVar, get_type_hints
 
 import torch
 import warp as wp
 
+from . import threads
 from .launch import as_argument, launch_adjoint, torch_stream
 from .launch import launch as run
 from .recorded import notes
@@ -53,6 +55,8 @@ def row_operator(
     rows: str,
     gradients: Sequence[str] = (),
     backward: wp.Kernel | None = None,
+    owner: str | None = None,
+    shared: Sequence[str] = (),
 ) -> Callable[..., Any]:
     """Registers `warpgarment::name`, an operator that runs `kernel` once per row.
 
@@ -65,6 +69,9 @@ def row_operator(
         gradients: Names of the inputs that gradients flow to.
         backward: Kernel that takes the inputs, then the gradients of the results, and writes those of these inputs;
             None for the adjoint that Warp derives.
+        owner: Name of an input with what each row belongs to, int32 in rising order. Rows that belong to different
+            things add to different parts of all gradients, so on a CPU their adjoints run on several threads.
+        shared: Names of the inputs that have no row for each row; asked for with an `owner`.
 
     Returns:
         The operator. It takes tensors in the order of `inputs` and returns one tensor, or a tuple of several. It does
@@ -111,17 +118,30 @@ def row_operator(
                 backward, at.shape[0], given, [(r, types[i]) for r, i in zip(results, wanted, strict=True)], at.device
             )
             return unpacked(results)
-        adjoints: list[object] = [None] * len(names)
-        for i, gradient in zip(wanted, results, strict=True):
-            adjoints[i] = as_argument(gradient, types[i])
         # The adjoint writes into the incoming gradients, which autograd may still hold, so it is given copies. It also
         # runs the forward pass again, whose results go to scratch memory.
         copies = [torch.clone(g, memory_format=torch.contiguous_format) for g in incoming]
         scratch = empty_outputs(arguments, torch.empty)
-        given = [*zip(arguments, types, strict=True), *zip(scratch, kinds, strict=True)]
-        adjoints += [as_argument(t, kind) for t, kind in zip(copies, kinds, strict=True)]
-        with torch_stream(at.device) as warp_device:
-            launch_adjoint(kernel, at.shape[0], [as_argument(t, kind) for t, kind in given], adjoints, warp_device)
+        gradient_of = dict(zip(wanted, results, strict=True))
+
+        def adjoint(begin: int, end: int) -> None:
+            def of(i: int, tensor: torch.Tensor) -> torch.Tensor:
+                return tensor if owner is None or names[i] in shared else tensor[begin:end]
+
+            given = [as_argument(of(i, tensor), types[i]) for i, tensor in enumerate(arguments)]
+            made = [as_argument(tensor[begin:end], kind) for tensor, kind in zip(scratch, kinds, strict=True)]
+            adjoints: list[object] = [None] * len(names)
+            for i, tensor in gradient_of.items():
+                adjoints[i] = as_argument(of(i, tensor), types[i])
+            adjoints += [as_argument(tensor[begin:end], kind) for tensor, kind in zip(copies, kinds, strict=True)]
+            with torch_stream(at.device) as warp_device:
+                launch_adjoint(kernel, end - begin, [*given, *made], adjoints, warp_device)
+
+        begins = [0, at.shape[0]]
+        if owner is not None and at.device.type == "cpu" and threads.count() > 1:
+            belongs = arguments[names.index(owner)]
+            begins[1:1] = ((belongs[1:] != belongs[:-1]).nonzero()[:, 0] + 1).tolist()
+        threads.spread([partial(adjoint, begin, end) for begin, end in itertools.pairwise(begins)])
         return unpacked(results)
 
     def fake_backward(*tensors: torch.Tensor) -> Any:

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import as_argument, launch, torch_stream
+from warpgarment.kernels.launch import as_argument, launch_rows, torch_stream
 from warpgarment.kernels.linear.conjugate_gradients import after_step
 from warpgarment.kernels.linear.system import System, block_dim, block_sum
 from warpgarment.kernels.operator import allocate
@@ -171,6 +171,7 @@ def displacement(
 
 @wp.kernel(enable_backward=False)
 def response(
+    from_row: wp.int32,
     by_rows: wp.int32,
     # Model:
     start: wp.array[wp.int32],
@@ -186,7 +187,7 @@ def response(
     gap: wp.array[wp.float64],
 ):
     """n·(Z g) at the contacts, what the adjoint has in place of c."""
-    i = wp.tid()
+    i = from_row + wp.tid()
     component = vertex_component[i]
     n = normal[i]
     h = wp.float64(0.0)
@@ -301,7 +302,7 @@ def respond(
     """n·(Z g) at the contacts, float64 [V], for a load g, float64 [V,3]; zero elsewhere."""
     gap = allocate((len(normal),), torch.float64, normal.device)
     with torch_stream(normal.device) as device:
-        launch(
+        launch_rows(
             response,
             len(normal),
             [
@@ -314,8 +315,8 @@ def respond(
                 as_argument(model.values, wp.float32),
                 as_argument(normal, wp.vec3d),
                 as_argument(load, wp.vec3d),
-                as_argument(gap, wp.float64),
             ],
+            [as_argument(gap, wp.float64)],
             device,
         )
     return gap

@@ -51,7 +51,7 @@ STEP = 32  # rows of a tile: widths are padded to a multiple of it
 WIDEST = 256  # most columns of a layer, for which blocks have room
 COLUMNS = 16  # of a tile
 
-_VECTORS_GUARD = """
+VECTORS_GUARD = """
 #if defined(__AVX512F__) || (defined(__AVX2__) && defined(__FMA__)) || (defined(__aarch64__) && defined(__ARM_NEON))
 """
 _VECTORS = """
@@ -141,7 +141,7 @@ ON_TILES = tiles.present() and os.environ.get("WARPGARMENT_TILES") != "0"
 _asked = [getattr(torch.cpu, name, bool) for name in ("_is_vnni_supported", "_is_avx512_supported")]
 INTEGERS = not ON_TILES and all(ask() for ask in _asked)
 """Whether inner layers are products of integers in this process."""
-_GUARD = tiles.GUARD if ON_TILES else integers.GUARD if INTEGERS else _VECTORS_GUARD
+_GUARD = tiles.GUARD if ON_TILES else integers.GUARD if INTEGERS else VECTORS_GUARD
 
 
 def source(body: str) -> str:

@@ -6,28 +6,30 @@ With n(x) = (x - mean) / deviation over the numbers of a face, and m the mean of
     dh = gelu'(h) * V^T dy,   dW = sum dh [n, m]^T,   db = sum dh,   dV = sum dy gelu(h)^T,   dc = sum dy
     dx = dy + n'(x)^T (the part of n in W^T dh, and a third of the part of m at each face that hears this one)
 
-The scale and shift of the layer norm belong to W and b: see `warpgarment/nn/patches/trained.py`. Sums over faces are
-those of `PART` blocks each, which are then added in their order.
+The scale and shift of the layer norm belong to W and b: see `warpgarment/nn/patches/trained.py`. Gradients of
+weights are added up by calls of their own, since nothing that follows in a graph waits for them.
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
-from warpgarment.kernels.launch import launch_rows, torch_stream
+from warpgarment.kernels.launch import launch, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .products import BLOCK, argument
-from .trained_blocks import back_block, gradient_part, layer_block, norm_block
+from .trained_blocks import back_block, layer_block, norm_block, outer_faces, slope_block
 
 wp.set_module_options(compiling.options())
 
 LEAST = 16  # blocks that are worth another range of a launch
-PART = 12  # blocks whose gradients of weights are summed by one thread
+PART = 1024  # faces whose part of the gradients of weights is one call
 
 
 @wp.kernel(enable_backward=False)
@@ -83,41 +85,43 @@ def layer_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def gradient_kernel(
+def slope_kernel(
     from_row: wp.int32,
-    parts: wp.int32,
     count: wp.int32,
     width: wp.int32,
     hidden: wp.int32,
     hears: wp.int32,
     # Model:
-    side: wp.array[wp.int64],
     expand: wp.array[wp.float32],
     contract: wp.array[wp.float32],
+    # In:
+    inner: wp.array[wp.float32],
+    gradient: wp.array[wp.float32],
+    # Out:
+    slopes: wp.array[wp.float32],
+    heard: wp.array[wp.float32],
+):
+    slope_block(from_row + wp.tid(), count, width, hidden, hears, expand, contract, inner, gradient, slopes, heard)
+
+
+@wp.kernel(enable_backward=False)
+def outer_kernel(
+    begin: wp.int32,
+    end: wp.int32,
+    width: wp.int32,
+    hidden: wp.int32,
+    hears: wp.int32,
+    # Model:
+    side: wp.array[wp.int64],
     # In:
     own: wp.array[wp.float32],
     inner: wp.array[wp.float32],
     gradient: wp.array[wp.float32],
-    # Out:
-    heard: wp.array[wp.float32],
+    slopes: wp.array[wp.float32],
+    # In and out:
     sums: wp.array[wp.float32],
 ):
-    gradient_part(
-        from_row + wp.tid(),
-        parts,
-        count,
-        width,
-        hidden,
-        hears,
-        side,
-        expand,
-        contract,
-        own,
-        inner,
-        gradient,
-        heard,
-        sums,
-    )
+    outer_faces(begin, end, width, hidden, hears, side, own, inner, gradient, slopes, sums)
 
 
 @wp.kernel(enable_backward=False)
@@ -167,16 +171,6 @@ class Found(NamedTuple):
     inner: torch.Tensor  # h [N,H]
 
 
-class Gradients(NamedTuple):
-    """Gradients of what the names say, with the shapes of W, b, V and c."""
-
-    faces: torch.Tensor
-    expand: torch.Tensor
-    expand_bias: torch.Tensor
-    contract: torch.Tensor
-    contract_bias: torch.Tensor
-
-
 def layer(faces: torch.Tensor, weights: Weights, around: Around) -> tuple[torch.Tensor, Found]:
     """The layer on faces [N,F], end to end; returns new faces [N,F], and what `gradients` needs."""
     faces = faces.contiguous()
@@ -195,23 +189,41 @@ def layer(faces: torch.Tensor, weights: Weights, around: Around) -> tuple[torch.
     return result, Found(own, scale, inner)
 
 
-def gradients(gradient: torch.Tensor, found: Found, weights: Weights, around: Around) -> Gradients:
-    """Gradients of the layer from that of its result, [N,F]."""
-    gradient = gradient.contiguous()
+def gradients(
+    gradient: torch.Tensor, found: Found, weights: Weights, around: Around
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gradients of faces [N,F] and of h [N,H] from that of the result, contiguous [N,F]."""
     count, width = gradient.shape
     hidden, hears = found.inner.shape[1], int(len(around.side) > 0)
-    wide, blocks = (1 + hears) * width, -(-count // BLOCK)
-    parts = -(-blocks // PART)
-    heard = allocate((count, wide), torch.float32, gradient.device)
-    lengths = [hidden * wide, hidden, width * hidden, width]
-    sums = allocate((parts, sum(lengths)), torch.float32, gradient.device)
+    blocks = -(-count // BLOCK)
+    heard = allocate((count, (1 + hears) * width), torch.float32, gradient.device)
+    slopes = allocate(found.inner.shape, torch.float32, gradient.device)
     result = allocate(gradient.shape, torch.float32, gradient.device)
     own, given, read = argument(found.own), argument(gradient), argument(heard)
-    model = [argument(values) for values in (around.side, weights.expand_back, weights.contract_back)]
     with torch_stream(gradient.device) as device:
-        inputs = [parts, count, width, hidden, hears, *model, own, argument(found.inner), given]
-        launch_rows(gradient_kernel, parts, inputs, [read, argument(sums)], device, least=1)
+        model = [argument(weights.expand_back), argument(weights.contract_back)]
+        inputs = [count, width, hidden, hears, *model, argument(found.inner), given]
+        launch_rows(slope_kernel, blocks, inputs, [argument(slopes), read], device, least=LEAST)
         inputs = [count, width, hears, argument(around.start), argument(around.owner), own, argument(found.scale)]
         launch_rows(back_kernel, blocks, [*inputs, read, given], [argument(result)], device, least=LEAST)
-    expand, expand_bias, contract, contract_bias = sums.sum(dim=0).split(lengths)
-    return Gradients(result, expand.view(hidden, wide), expand_bias, contract.view(width, hidden), contract_bias)
+    return result, slopes
+
+
+def sums_size(width: int, hidden: int, hears: bool) -> int:
+    """Number of entries of the gradients of W, b, V and c, which follow one another."""
+    return hidden * (1 + hears) * width + hidden + width * hidden + width
+
+
+def outer(
+    gradient: torch.Tensor, slopes: torch.Tensor, found: Found, around: Around, sums: torch.Tensor
+) -> list[Callable[[], None]]:
+    """Calls that add the gradients of weights to `sums` [`sums_size`], of which no two may run at the same time."""
+    count, width = gradient.shape
+    hidden, hears = slopes.shape[1], int(len(around.side) > 0)
+
+    def some(begin: int, end: int) -> None:
+        read = [argument(values) for values in (around.side, found.own, found.inner, gradient, slopes, sums)]
+        with torch_stream(gradient.device) as device:
+            launch(outer_kernel, 1, [begin, end, width, hidden, hears, *read], device)
+
+    return [functools.partial(some, begin, min(begin + PART, count)) for begin in range(0, count, PART)]

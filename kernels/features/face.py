@@ -246,6 +246,8 @@ _face_features = row_operator(
     {"features": (wp.float32, (FEATURES,))},
     rows="faces",
     gradients=["vertices", "garment_mean"],
+    owner="garment_of_face",
+    shared=["vertices", "garment_mean"],
 )
 
 

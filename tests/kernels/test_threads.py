@@ -76,3 +76,49 @@ def test_torch_works_on_one_thread_and_then_as_before(three):
             assert (torch.get_num_threads(), threads.count()) == (1, 3)
         assert torch.get_num_threads() == 1
     assert (torch.get_num_threads(), threads.count()) == (3, 3)
+
+
+def test_calls_aside_run_in_their_order_and_once(three):
+    """Sums would be added up by two threads at a time, or a call be lost that no thread has begun at the end."""
+    started, go, order = threading.Event(), threading.Event(), []
+    aside = threads.Aside()
+
+    def first():
+        started.set()
+        go.wait(60)
+        order.append(0)
+
+    aside.add(first)
+    for number in range(1, 20):
+        aside.add(lambda number=number: order.append(number))
+    assert started.wait(60)  # on another thread, while this one goes on
+    assert order == []
+    go.set()
+    aside.finish()
+    assert order == list(range(20))
+
+
+def test_calls_that_are_spread_need_no_thread_that_is_busy_aside(three):
+    """A launch would wait until gradients of weights are added up that nobody needs yet."""
+    go, seen, asides = threading.Event(), [], [threads.Aside() for _ in range(4)]
+    for aside in asides:
+        aside.add(lambda: go.wait(60))
+    threads.spread([lambda n=n: seen.append(n) for n in range(6)])
+    assert sorted(seen) == list(range(6))
+    go.set()
+    for aside in asides:
+        aside.finish()
+
+
+def test_an_exception_of_a_call_aside_is_raised_when_it_is_finished(three):
+    """A fault in a thread would be lost, and sums without it be the gradient."""
+    aside, seen = threads.Aside(), []
+
+    def fail():
+        raise ValueError("of the second")
+
+    for call in (lambda: seen.append(0), fail, lambda: seen.append(2)):
+        aside.add(call)
+    with pytest.raises(ValueError, match="of the second"):
+        aside.finish()
+    assert seen == [0]

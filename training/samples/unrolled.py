@@ -116,7 +116,9 @@ class UnrolledBuilder:
         sees them in subsets of about `faces` faces (None: all at once). A later batch may take over the scene of one
         that is gone, of whose losses no gradients may be asked then."""
         total = sum(self.sequences[s].components for s, _ in picks) / len(picks)
-        picks, streams, overrides = part_of(picks, rng, displacements, part)
+        chosen = part_of(picks, rng, displacements, part)
+        together = sorted(zip(*chosen, strict=True), key=lambda sample: sample[0][0])  # so that scenes come again
+        picks, streams, overrides = (list(values) for values in zip(*together, strict=True))
         history, device = self.network.config.history, self.device
         mine = [self.sequences[s] for s, _ in picks]
         face_splits = 1 if faces is None else max(round(min(len(data.faces) for data in mine) / faces), 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import gc
 import json
@@ -15,6 +16,7 @@ import torch
 from tqdm import tqdm
 
 from warpgarment.io.npz import write_npz
+from warpgarment.kernels.threads import torch_on_one
 from warpgarment.metrics import mean_vertex_error
 from warpgarment.nn import checkpoint
 from warpgarment.nn.faces.grow import untrained
@@ -182,6 +184,11 @@ class Run:
 
     def loop(self) -> None:
         """Trains until the run is over."""
+        shares = self.network.shares_threads and self.device.type == "cpu"
+        with torch_on_one() if shares else contextlib.nullcontext():
+            self._loop()
+
+    def _loop(self) -> None:
         config = self.config
         last = config.steps if config.steps is not None else 2**31
         hidden = not self.group.first
@@ -194,6 +201,7 @@ class Run:
             self.rate.go()
             for batch in self.loader.batches(self.step, until):
                 self.update(batch)
+                del batch  # the next one may take over its scene
                 self.step += 1
                 if not settled:  # all is loaded that later collections of garbage need not look at
                     gc.freeze()

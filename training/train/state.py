@@ -33,14 +33,16 @@ class Average:
     def __init__(self, network: GarmentNetwork, decay: float) -> None:
         self.network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay, self.updates = decay, 0
+        self._mine: list[torch.Tensor] = list(self.network.parameters())
+        self._buffers = list(self.network.buffers())
 
     @torch.no_grad()
     def update(self, network: torch.nn.Module) -> None:
         """Adds the current weights to the average."""
         weight = 1.0 - min(self.decay, (1.0 + self.updates) / (10.0 + self.updates))
         self.updates += 1
-        torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), weight)
-        for mine, theirs in zip(self.network.buffers(), network.buffers(), strict=True):
+        torch._foreach_lerp_(self._mine, list(network.parameters()), weight)
+        for mine, theirs in zip(self._buffers, network.buffers(), strict=True):
             mine.copy_(theirs)
 
 

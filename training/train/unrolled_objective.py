@@ -44,6 +44,7 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
 from warpgarment.nn.rows import PaddedView
 from warpgarment.nn.run import run
+from warpgarment.sim.history import History, Stacks
 from warpgarment.training.samples.unrolled import UnrolledBatch
 
 from .cloth_losses import ClothLossConfig, ClothLosses, ClothState
@@ -173,8 +174,12 @@ class UnrolledObjective(nn.Module):
         vertices, history, features = batch.vertices, batch.history, batch.features
         before, packed = batch.before, scene.packed
         live: list[torch.Tensor] = []  # features of the newest frames, to which gradients flow
+        # Operators of other networks keep what they read, which a stack that overlaps with later ones would change.
+        overlap = self.network.takes_frames and not self.noise
+        stacks = Stacks() if overlap else History.stacked
         for k, recorded in enumerate(batch.recorded):
-            stacked = history.stacked(features.detach())
+            stacked = stacks(history, features.detach())
+            assert isinstance(stacked, torch.Tensor)  # such stacks are not apart
             live = [*live, features][-config.history :] if features.requires_grad else live
             newest = context(features, scene.packed.face_component, scene.packed.component_count)
             target = targets(self._wanted(batch, vertices, features, k), newest, residual=config.residual)

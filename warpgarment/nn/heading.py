@@ -78,5 +78,8 @@ def rotate_vectors(vectors: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:
 
 def rotate_matrices(matrices: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:
     """Maps from space to space (Psi, R) turned: G A G^T, [B,N,3,3] by [B,3,3] -> [B,N,3,3]."""
+    if torch.is_grad_enabled():  # gradients of one product of matrices 9 x 9 are cheaper than of two of 3 x 3 a face
+        both = (frame[:, :, None, :, None] * frame[:, None, :, None, :]).reshape(-1, 9, 9)
+        return torch.bmm(matrices.flatten(-2), both.mT).unflatten(-1, (3, 3))
     turn = frame[:, None]
     return turn @ matrices @ turn.mT

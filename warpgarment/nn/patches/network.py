@@ -28,7 +28,7 @@ from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import Step
 from warpgarment.nn.rows import RowLayout
 
-from . import blocks, first, fused, trained
+from . import blocks, first, fused, trained, trained_encoder
 from .bags import Sums, sums_of
 from .layout import PatchLayout
 
@@ -224,7 +224,6 @@ class PatchTransformer(GarmentNetwork):
     ) -> NormalisedOutput:
         """Embedded faces [B,N,F] and velocities [B,C,E] -> normalised output."""
         batch, count = faces.shape[:2]
-        patches = weights.start.shape[1]
         if blocks.by_blocks(faces):
             mask = self.key_mask(weights, velocity_mask, tokens)
             answer, velocity = blocks.forward(self, faces.contiguous(), tokens, weights, mask)
@@ -232,28 +231,39 @@ class PatchTransformer(GarmentNetwork):
             return NormalisedOutput(psi, singular_values, velocity)
         sums = sums_of(weights, batch)
         faces = self.before(faces.flatten(0, 1), sums.around)
+        faces, velocity = self._encoded(faces.unflatten(0, (batch, count)), tokens, weights, velocity_mask)
+        for layer in self.after:
+            faces = layer(faces, sums.around)
+        with torch.autocast(faces.device.type, enabled=False):
+            precise = self.face_head.weight.dtype
+            answer = self.face_head(self.face_norm(faces.to(precise))).unflatten(0, (batch, count))
+            psi, singular_values = answer.split([9, 3], dim=-1)
+            return NormalisedOutput(psi, singular_values, velocity)
+
+    def _encoded(
+        self, faces: torch.Tensor, tokens: torch.Tensor, weights: PatchLayout, velocity_mask: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Faces with what they hear of the patches, end to end [B*N,F], and normalised velocities [B,C,3]."""
+        batch, patches = len(faces), weights.start.shape[1]
+        mask = self.key_mask(weights, velocity_mask, tokens)
+        if trained_encoder.fits(self, faces, weights):
+            heard, velocity = trained_encoder.forward(self, faces, tokens, weights, mask)
+            return heard.flatten(0, 1), velocity
+        sums, faces = sums_of(weights, batch), faces.flatten(0, 1)
         pooled = sums.pool(faces).unflatten(0, (batch, patches))
         mean = _rows(weights.pieces, batch).to(pooled.dtype) @ pooled
         tokens = torch.cat([self.to_patches(pooled), tokens + one_by_one(self.to_velocity, mean)], dim=1)
         kind = faces.device.type
         half = torch.is_autocast_enabled(kind)
         geodesic = weights.weights.to(torch.get_autocast_dtype(kind) if half else tokens.dtype)
-        mask = self.key_mask(weights, velocity_mask, mean)
         before = tokens
         for layer in self.layers:
             tokens = layer(tokens, geodesic, mask)
         heard = self.from_patches((tokens - before)[:, :patches]).flatten(0, 1)
         tokens = self.final_norm(tokens)
-        faces = faces + sums.spread(heard)
-        for layer in self.after:
-            faces = layer(faces, sums.around)
         with torch.autocast(kind, enabled=False):
-            precise = self.face_head.weight.dtype
-            answer = self.face_head(self.face_norm(faces.to(precise))).unflatten(0, (batch, count))
-            psi, singular_values = answer.split([9, 3], dim=-1)
-            return NormalisedOutput(
-                psi, singular_values, one_by_one(self.velocity_head, tokens[:, patches:].to(precise))
-            )
+            precise = tokens[:, patches:].to(self.velocity_head.weight.dtype)
+            return faces + sums.spread(heard), one_by_one(self.velocity_head, precise)
 
     @staticmethod
     def key_mask(weights: PatchLayout, velocity_mask: torch.Tensor | None, v: torch.Tensor) -> torch.Tensor | None:

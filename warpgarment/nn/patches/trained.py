@@ -7,6 +7,7 @@ The scale g and shift s of the layer norm are part of the weights of the kernels
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -18,13 +19,15 @@ from warpgarment.kernels.dense import products, trained
 
 from . import changes
 from .fused import packed_weights
+from .gathered import Gathered, behind_norm
 
 if TYPE_CHECKING:
     from .bags import Sums
     from .network import FaceLayer
 
-Key = tuple[int, tuple[tuple[int, int], ...]]
-_packed: WeakKeyDictionary[nn.Module, tuple[Key, trained.Weights]] = WeakKeyDictionary()
+Key = tuple[int, tuple[tuple[int, int, bool], ...]]
+Known = tuple[Key, trained.Weights, Gathered, torch.Tensor]
+_packed: WeakKeyDictionary[nn.Module, Known] = WeakKeyDictionary()
 
 
 def fits(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> bool:
@@ -40,23 +43,50 @@ def fits(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> bool:
 
 def forward(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> torch.Tensor:
     """`FaceLayer.forward` of faces [N,F]."""
-    hear = [layer.hear.weight] if layer.hears else []
-    given = [layer.norm.weight, layer.norm.bias, layer.expand.weight, layer.expand.bias]
-    result: torch.Tensor = _Layer.apply(
-        faces, layer, around if layer.hears else None, *given, layer.contract.weight, layer.contract.bias, *hear
-    )
+    _, weights, gathered, token = weights_of(layer)
+    heard = _around(around if layer.hears else None)
+    result: torch.Tensor = _Layer.apply(faces, token, weights, gathered, heard)
     return result
 
 
-def weights_of(layer: FaceLayer) -> trained.Weights:
-    """The packed weights of a layer, made anew when one has changed."""
-    versions = [(parameter.data_ptr(), changes.version(parameter)) for parameter in layer.parameters()]
+def weights_of(layer: FaceLayer) -> Known:
+    """The packed weights of a layer and what gathers their gradients, made anew when one has changed."""
+    parameters = _parameters(layer)
+    versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
     key = changes.optimiser_steps(), tuple(versions)
     known = _packed.get(layer)
     if known is None or known[0] != key:
-        known = key, _pack(layer)
+        size = trained.sums_size(layer.expand.in_features, layer.expand.out_features, layer.hears)
+        gathered = Gathered(size, functools.partial(_unfolded, [each.detach() for each in parameters]))
+        known = key, _pack(layer), gathered, gathered.token(parameters)
         _packed[layer] = known
-    return known[1]
+    return known
+
+
+def _parameters(layer: FaceLayer) -> list[torch.Tensor]:
+    """The parameters in the order in which their gradients are found."""
+    found = [layer.norm.weight, layer.norm.bias, layer.expand.bias, layer.contract.weight, layer.contract.bias]
+    return [*found, layer.expand.weight, *([layer.hear.weight] if layer.hears else [])]
+
+
+def _unfolded(parameters: list[torch.Tensor], sums: torch.Tensor) -> list[torch.Tensor]:
+    """Gradients of the parameters from those of W', b', V and c."""
+    scale, shift, _, contract, _, *parts = parameters
+    (hidden, width), wide = parts[0].shape, len(parts) * parts[0].shape[1]
+    slope, of_bias, of_contract, of_contract_bias = sums.split([hidden * wide, hidden, contract.numel(), width])
+    found = [
+        behind_norm(some, of_bias, scale, shift, part)
+        for part, some in zip(parts, slope.view(hidden, wide).split(width, dim=1), strict=True)
+    ]
+    of_scale, of_shift = (sum(values) for values in zip(*(norm for norm, _, _ in found), strict=True))
+    return [
+        of_scale,
+        of_shift,
+        of_bias,
+        of_contract.view(contract.shape),
+        of_contract_bias,
+        *(of for _, of, _ in found),
+    ]
 
 
 @torch.no_grad()
@@ -78,27 +108,28 @@ def _around(around: Sums | None) -> trained.Around:
 
 class _Layer(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, faces: torch.Tensor, layer: FaceLayer, around: Sums | None, *given: torch.Tensor) -> Any:
-        ctx.weights, ctx.around = weights_of(layer), _around(around)
-        result, found = trained.layer(faces, ctx.weights, ctx.around)
-        ctx.save_for_backward(*given)
-        ctx.found = found
+    def forward(
+        ctx: Any,
+        faces: torch.Tensor,
+        token: torch.Tensor,
+        weights: trained.Weights,
+        gathered: Gathered,
+        around: trained.Around,
+    ) -> torch.Tensor:
+        result, found = trained.layer(faces, weights, around)
+        ctx.made, ctx.of_weights = (weights, gathered, around, found), token.requires_grad
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        scale, shift, weight, _bias, _contract, _contract_bias, *hear = ctx.saved_tensors
-        found = trained.gradients(gradient, ctx.found, ctx.weights, ctx.around)
-        ctx.found = None
-        parts = [weight, *hear]
-        of_scale, of_shift, of_parts = torch.zeros_like(scale), torch.zeros_like(shift), []
-        shifted = torch.outer(found.expand_bias, shift)
-        for part, slope in zip(parts, found.expand.split(weight.shape[1], dim=1), strict=True):
-            of_parts.append(torch.addcmul(shifted, slope, scale))
-            of_scale += (part * slope).sum(dim=0)
-            of_shift += found.expand_bias @ part
-        of_contract = found.contract, found.contract_bias
-        return (
-            found.faces, None, None, of_scale, of_shift, of_parts[0], found.expand_bias, *of_contract, *of_parts[1:]
-        )  # fmt: skip
+        weights, gathered, around, found = ctx.made
+        ctx.made, of_token = None, None
+        gradient = gradient.contiguous()
+        of_faces, slopes = trained.gradients(gradient, found, weights, around)
+        if ctx.of_weights:
+            sums, aside = gathered.sums()
+            for call in trained.outer(gradient, slopes, found, around, sums):
+                aside.add(call)
+            of_token = sums.new_zeros(())
+        return of_faces, of_token, None, None, None
