@@ -66,7 +66,8 @@ def directed(way: np.ndarray) -> np.ndarray:
 def test_the_first_face_is_met(name, wide):
     """A ray that ends at a face that is further away would leave cloth inside an arm or a chest.
 
-    Rays of any direction and length, and along axes, where boxes are flat. Distances within 4e-6 m, rounding of float32.
+    Rays of any direction and length, and along axes, where boxes are flat.
+    Distances within 4e-6 m, rounding of float32.
     """
     body, rng, count = BODIES[name], np.random.default_rng(0), 600
     low, high = body.vertices.min(0) - 0.2, body.vertices.max(0) + 0.2
