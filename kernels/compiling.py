@@ -14,6 +14,8 @@ from typing import Any
 
 import warp as wp
 
+from .started import start
+
 _WARPS_OWN = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
     " -mllvm=-slp-recursion-max-depth=4"
@@ -82,7 +84,7 @@ def ahead(names: Iterable[str]) -> int:
     Returns:
         The number of modules that were compiled.
     """
-    wp.init()
+    start()
     modules = [wp.get_module(f"warpgarment.kernels.{name}") for name in names]
     missing = [module for module in modules if module.kernels and not _is_cached(module)]
     workers = min(len(missing), _cores(), MOST_WORKERS)

@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from . import recorded, threads
+from .started import start
 
 if wp.config.log_level == wp.LOG_INFO:  # the user's own setting stays; Warp's default prints at every module load
     wp.config.log_level = wp.LOG_WARNING
@@ -64,7 +65,7 @@ def expect(
 
 def as_warp(tensor: torch.Tensor, dtype: type) -> wp.array:
     """A Warp array over the tensor's memory, without a gradient buffer; copies only a tensor that is not contiguous."""
-    wp.init()
+    start()
     if tensor.numel() == 0:
         tensor = tensor.new_empty(tensor.shape)  # empty slices have strides that Warp refuses
     return cast(wp.array, wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False))
@@ -220,12 +221,12 @@ def _on_cpu() -> contextlib.AbstractContextManager[wp.Device]:
 
 @contextlib.contextmanager
 def _on_stream(device: torch.device) -> Iterator[wp.Device]:
-    wp.init()  # at first use and not at import, so that importing never touches a driver
+    start()  # at first use and not at import, so that importing never touches a driver
     with wp.ScopedStream(wp.stream_from_torch(device), sync_enter=False):
         yield wp.device_from_torch(device)
 
 
 @functools.cache
 def _cpu() -> wp.Device:
-    wp.init()
+    start()
     return wp.get_device("cpu")

@@ -92,9 +92,9 @@ class Compliance(NamedTuple):
 
 def _inverted(block: scipy.sparse.csc_matrix, padding: int, device: torch.device) -> torch.Tensor:
     """The inverse of a block, float32, row by row with padding at the end of each."""
-    lower = torch.linalg.cholesky(torch.from_numpy(block.toarray()).to(device))
-    inverse = torch.cholesky_inverse(lower)
-    del lower
+    inverse = torch.from_numpy(block.toarray(order="F")).to(device)  # by columns: LAPACK works in place
+    torch.linalg.cholesky(inverse, out=inverse)
+    torch.cholesky_inverse(inverse, out=inverse)
     if device.type != "cpu":  # LAPACK finds a triangle, which torch copies; on GPUs it is a solve
         inverse = 0.5 * (inverse + inverse.T)
     size = len(inverse)

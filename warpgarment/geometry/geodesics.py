@@ -199,15 +199,19 @@ def surface_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
 
 
 def _segments(mesh: _Unfolding) -> csr_matrix:
-    seen = [mesh.spread(mesh.from_centroids()), mesh.spread(mesh.from_vertices()), mesh.over_midpoints()]
-    source, target, length = (np.concatenate(parts) for parts in zip(*seen, strict=True))
-    del seen
-    low, high = np.minimum(source, target).astype(np.int64), np.maximum(source, target)
-    key = low * mesh.node_count + high
+    keys, lengths = [], []
+    for source, target, length in mesh.seen():
+        keys.append(np.minimum(source, target).astype(np.int64) * mesh.node_count + np.maximum(source, target))
+        lengths.append(length)
+        del source, target  # two thirds of what the next ones take
+    key, length = np.concatenate(keys), np.concatenate(lengths)
+    del keys, lengths
     order = np.argsort(key)
     key, length = key[order], length[order]
-    first = np.nonzero(np.diff(key, prepend=-1))[0]
+    del order
+    first = np.nonzero(np.concatenate([[True], key[1:] != key[:-1]]))[0]
     length, (low, high) = np.minimum.reduceat(length, first), np.divmod(key[first], mesh.node_count)
+    del key, first
     keep = low != high
     low, high, length = low[keep].astype(np.int32), high[keep].astype(np.int32), length[keep]
     return csr_matrix(
@@ -257,7 +261,13 @@ class _Unfolding:
         place = np.minimum(np.searchsorted(forward[order], backward), len(order) - 1)
         return np.where(forward[order][place] == backward, order[place], -1)
 
-    def over_midpoints(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def seen(self) -> Iterator[Seen]:
+        """All straight segments; most come from both of their ends, some twice from one."""
+        yield self.spread(self.from_centroids())
+        yield self.spread(self.from_vertices())
+        yield self.over_midpoints()
+
+    def over_midpoints(self) -> Seen:
         """Segments between neighbours by way of the middle of their edge, which link even faces without area."""
         half = np.nonzero(self.twin >= 0)[0]
         to_middle = np.linalg.norm(
