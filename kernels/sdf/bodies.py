@@ -131,7 +131,7 @@ class BodyMeshes:
         self._memory = tensors
         self._trees = Trees(self._vertices, self._faces, face_starts) if wide else None
         self.model.tree = self._trees.model if self._trees else no_trees(vertices.device)
-        self.argument = wp.array([self.model], dtype=Bodies, device=str(vertices.device))
+        self.argument: wp.array = wp.array([self.model], dtype=Bodies, device=str(vertices.device))
         """Argument of kernels: arrays over the memory of this object, which must outlive their launches."""
         self._measure_loops()
 
@@ -208,7 +208,7 @@ class BodyMeshes:
             within: Distance [m], a number or float32 [N]. For points outside that are at least this far from the body
                 the search stops early and the distance is infinite, which is many times faster. Points inside get an
                 answer at any depth.
-        clear: Radius of a ball around each point that is known to hold no surface, as `surface_depth.Measured` has
+        clear: Radius of a ball around each point that is known to hold no surface, as `vertex_depth.Measured` has
             it [m], float32 [N]. It changes the time only.
         """
         expect("points", points, (None, 3), device=self.device)

@@ -15,8 +15,7 @@ an edge of the garment can still be missed.
 A vertex outside at a distance r from the body has a ball of that radius around it without any surface: the middles of
 edges and faces and the points c within it are outside too, and are not examined. Distances are found up to a limit of
 less than an edge. A point of a triangle is no further from the nearest corner than 1/√3 of the longest edge; so the
-balls of a face whose corners are further from the body hold all of it. A vertex that moved by a small part of r since
-an earlier measurement, on a body that did not move, is still outside, with a ball that is smaller by that.
+balls of a face whose corners are further from the body hold all of it.
 
 | symbol | code | what |
 | --- | --- | --- |
@@ -39,11 +38,12 @@ from warpgarment.kernels.launch import as_argument, expect, launch, launch_rows,
 from warpgarment.kernels.operator import allocate
 
 from .bodies import BodyMeshes
-from .closest import BEYOND, ROUNDING, SEARCHES, closest_on_body
+from .closest import ROUNDING, SEARCHES, closest_on_body
 from .model import Bodies, exists, has_tree
 from .nearest_face import closest_on_triangle
 from .tree_boxes import boxes_in_box, triangles_above
 from .tree_search import least, least_above, stack64
+from .vertex_depth import Measured, measured
 
 wp.set_module_options(compiling.options())
 
@@ -53,19 +53,6 @@ ROOM = wp.constant(0.01001)
 """Margin of the box around a face in which its tips are [m], a little more than l."""
 COVERED = wp.constant(0.57736)
 """1/√3, and some rounding."""
-MOVED = wp.constant(0.25)
-"""Part of its ball by which a vertex may have moved since it was measured."""
-
-
-class Measured(NamedTuple):
-    """What is known of vertices, on bodies that have not moved since."""
-
-    positions: torch.Tensor
-    """Where they were measured [m], float32 [V,3]."""
-    depth: torch.Tensor
-    """Depth of each vertex [m], float32 [V]."""
-    clear: torch.Tensor
-    """Radius of the ball around each vertex that holds no surface [m], float32 [V]."""
 
 
 class SurfaceDepth(NamedTuple):
@@ -198,45 +185,6 @@ def feet_of_tips(
     feet[i] = foot
 
 
-@wp.kernel(enable_backward=False, module=SEARCHES)
-def depth_of_vertices(
-    from_row: wp.int32,
-    # Model:
-    bodies: wp.array[Bodies],
-    # In:
-    vertices: wp.array[wp.vec3],
-    body_of_vertex: wp.array[wp.int32],
-    limit: wp.float32,
-    measured: wp.array[wp.vec3],  # where vertices were measured before, with the next two; or empty
-    depth_before: wp.array[wp.float32],
-    clear_before: wp.array[wp.float32],
-    # Out:
-    depth: wp.array[wp.float32],
-    clear: wp.array[wp.float32],
-):
-    i = from_row + wp.tid()
-    depth[i] = 0.0
-    clear[i] = 0.0
-    b = body_of_vertex[i]
-    if exists(bodies, b):
-        if measured.shape[0] > 0:
-            moved = wp.length(vertices[i] - measured[i])
-            if moved == 0.0:
-                depth[i] = depth_before[i]
-                clear[i] = clear_before[i]
-                return
-            if moved < MOVED * clear_before[i]:
-                clear[i] = clear_before[i] - moved - ROUNDING
-                return
-        found, sign, _weights, closest = closest_on_body(bodies, b, vertices[i], limit)
-        if found >= 0:
-            away = wp.float32(wp.length(wp.vec3d(vertices[i]) - closest))
-            depth[i] = wp.where(sign < 0.0, away, 0.0)
-            clear[i] = wp.where(sign < 0.0, 0.0, away)
-        elif found == BEYOND:
-            clear[i] = limit
-
-
 @wp.func
 def in_ball(point: wp.vec3, centre: wp.vec3, radius: float) -> bool:
     """Whether a point is in a ball without surface."""
@@ -326,45 +274,6 @@ def collect_depth(
         wp.atomic_max(deepest, garment_of_vertex[corner[0]], between[i])
         for k in range(3):
             wp.atomic_max(missing, corner[k], more)
-
-
-def measured(
-    vertices: torch.Tensor,
-    bodies: BodyMeshes,
-    body_of_vertex: torch.Tensor,
-    *,
-    limit: float = 0.0,
-    before: Measured | None = None,
-) -> Measured:
-    """Depths of vertices, and the balls around those that are outside; without gradients.
-
-    Args:
-        vertices: Positions [m], float32 [V,3]; vertices that are not finite count as outside, without a ball.
-        bodies: The bodies at the same time step.
-        body_of_vertex: Body of each vertex, int32 [V]; a vertex with body -1 is in no body.
-        limit: Largest radius of a ball that is looked for [m].
-        before: What was found of the same vertices earlier, on the bodies where they are now, with the same
-            `body_of_vertex` or more of them on a body. Balls of vertices that hardly moved are then smaller by that.
-
-    Raises:
-        ValueError: Wrong shape or device.
-        TypeError: Wrong dtype.
-    """
-    device, size = vertices.device, len(vertices)
-    expect("vertices", vertices, (None, 3))
-    expect("body_of_vertex", body_of_vertex, (size,), torch.int32, device)
-    vertices = vertices.detach()
-    depth, clear = allocate((2, size), torch.float32, device)
-    earlier = Measured(depth.new_empty((0, 3)), depth[:0], depth[:0]) if before is None else before
-    if before is not None:
-        expect("before.positions", before.positions, (size, 3), device=device)
-    with torch_stream(device) as warp_device:
-        points, body = as_argument(vertices, wp.vec3), as_argument(body_of_vertex, wp.int32)
-        inputs = [bodies.argument, points, body, float(limit), as_argument(earlier.positions, wp.vec3)]
-        inputs += [as_argument(earlier.depth, wp.float32), as_argument(earlier.clear, wp.float32)]
-        found = [as_argument(depth, wp.float32), as_argument(clear, wp.float32)]
-        launch_rows(depth_of_vertices, size, inputs, found, warp_device)
-    return Measured(vertices, depth, clear)
 
 
 def surface_depth(

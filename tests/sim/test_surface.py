@@ -10,7 +10,8 @@ from support.poison import poison_outputs
 from support.scenes import network
 
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.surface_depth import Measured, surface_depth
+from warpgarment.kernels.sdf.surface_depth import surface_depth
+from warpgarment.kernels.sdf.vertex_depth import Measured
 from warpgarment.objects.body import BodyMotion
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator

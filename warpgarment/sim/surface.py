@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.surface_depth import Measured, SurfaceDepth, measured, surface_depth
+from warpgarment.kernels.sdf.surface_depth import SurfaceDepth, surface_depth
+from warpgarment.kernels.sdf.vertex_depth import Measured, measured
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 

@@ -20,7 +20,7 @@ from warpgarment.kernels.features.carry import carried, face_at_each_vertex
 from warpgarment.kernels.replay.pieces import Pieces
 from warpgarment.kernels.replay.recording import recording
 from warpgarment.kernels.sdf.bodies import BodyMeshes
-from warpgarment.kernels.sdf.surface_depth import Measured
+from warpgarment.kernels.sdf.vertex_depth import Measured
 from warpgarment.objects.pack import PackedGarments
 from warpgarment.sim.bodies import MovingBodies
 from warpgarment.sim.surface import Surface, distance_to_keep
