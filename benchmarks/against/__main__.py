@@ -34,6 +34,7 @@ from .processes import Worker, demo_motions, fresh, trained
 
 Row = dict[str, Any]
 SAME = 0.02  # mm by which one frame from the same state may differ
+NOISE, SEEDS = 1e-7, 8  # m by which known frames are moved, and how often, to see how much the earlier build differs
 
 
 class Builds(NamedTuple):
@@ -90,25 +91,33 @@ def _with_workers(builds: Builds, case: Case, options: argparse.Namespace, folde
 
 
 def _same_state(builds: Builds, case: Case, folder: Path) -> Row:
-    """Distance between the positions that both builds predict from the same history."""
-    answers = []
-    for python in builds:
+    """Distances of what the earlier build predicts from a history to today's prediction, and to its own with noise."""
+    given = case.options | {"motions": demo_motions(folder), "noise": 0.0, "seeds": [0]}
+
+    def predicted(python: Path, options: dict[str, Any]) -> list[np.ndarray]:
         worker = Worker(python, case.threads)
-        worker.ask("prepare", "case", "next", case.options | {"motions": demo_motions(folder)})
-        answers.append(worker.ask("run", "case")["result"])
-        worker.close()
-    apart = [
-        float(np.linalg.norm(np.subtract(one[2], other[2]), axis=1).max() * 1e3)
-        for one, other in zip(*answers, strict=True)
-    ]
+        try:
+            worker.ask("prepare", "case", "next", options)
+            return [np.array(positions) for _, _, positions in worker.ask("run", "case")["result"]]
+        finally:
+            worker.close()
+
+    def apart(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> list[float]:
+        return [float(np.linalg.norm(a - b, axis=1).max() * 1e3) for a, b in zip(one, other, strict=True)]
+
+    before, now = (predicted(python, given) for python in builds)
+    moved = predicted(builds.before, given | {"noise": NOISE, "seeds": list(range(SEEDS))})
+    between, itself = apart(before, now), apart([each for each in before for _ in range(SEEDS)], moved)
     row = {
         "what": case.what,
         "unit": "mm",
-        "states": len(apart),
-        "most": max(apart),
-        "median": statistics.median(apart),
+        "states": len(between),
+        "most": max(between),
+        "median": statistics.median(between),
+        "itself_most": max(itself),
+        "itself_median": statistics.median(itself),
     }
-    return row | {"target": SAME, "met": max(apart) <= SAME}
+    return row | {"target": SAME, "met": max(between) <= SAME}
 
 
 def _row(case: Case, figures: tuple[list[float], ...]) -> Row:
@@ -145,7 +154,9 @@ def shown(row: Row) -> list[str]:
     """The cells of a row."""
     target = "-" if row["target"] is None else f"{row['target']:g}"
     if "states" in row:
-        return [row["what"], "-", "-", f"{row['most']:.4f} {row['unit']}", "-", target, "yes" if row["met"] else "no"]
+        itself, between = (f"{row[name]:.4f} {row['unit']}" for name in ("itself_most", "most"))
+        cells = [row["what"], f"{itself} (beside itself, {NOISE:g} m of noise, {SEEDS} times)", between]
+        return [*cells, "-", "-", target, "yes" if row["met"] else "no"]
     times = [f"{row[f'{name}_least']:.3g} / {row[f'{name}_median']:.3g} {row['unit']}" for name in ("before", "now")]
     ratios = [f"{row['ratio']:.2f}", f"{row['ratio_of_medians']:.2f}"]
     met = "-" if row["target"] is None else "yes" if row["met"] else "no"

@@ -78,10 +78,16 @@ class SetUp:
 
 
 class NextFrames:
-    """The frame after each of several known histories, as positions: what two builds make of the same state."""
+    """The frame after each of several known histories, as positions: what two builds make of the same state.
 
-    def __init__(self, motions: list[str], starts: list[int], network: str = "fast") -> None:
+    Histories are moved by `noise` [m], in turn with each of the `seeds`.
+    """
+
+    def __init__(
+        self, motions: list[str], starts: list[int], noise: float, seeds: list[int], network: str = "fast"
+    ) -> None:
         self.motions, self.starts, self.simulator = motions, starts, simulator(network)
+        self.noise, self.seeds = noise, seeds
 
     def __call__(self) -> list[list[Any]]:
         """File of the motion, first known frame and positions [m] for each history."""
@@ -91,9 +97,10 @@ class NextFrames:
             with np.load(path) as data:
                 garment = wg.Garment(data["vertices"], data["faces"], pins=data["pins"])
                 frames, bodies, body_faces = data["frames"], data["body"], data["body_faces"]
-            for start in self.starts:
+            for start, seed in itertools.product(self.starts, self.seeds):
                 body = wg.BodyMotion(bodies[start:], body_faces, 30.0)
                 history = frames[start : start + known]
+                history = history + np.random.default_rng(seed).normal(0, self.noise, history.shape).astype(np.float32)
                 motion = self.simulator.rollout(garment, body, history=history, frames=known + 1)
                 found.append([path, start, motion.vertices[known].tolist()])
         return found
