@@ -36,15 +36,16 @@ from warpgarment.sim.stages.correct import Corrector
 from .history import copies
 
 USABLE = 0.9  # share of the free memory that a prediction may fill
-PER_FACE, PER_VERTEX = 400, 800  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
-PER_BODY_FACE, PER_BODY_VERTEX = 240, 60  # bytes of Warp's tree and of ours; of two positions
+PER_FACE, PER_VERTEX = 550, 1100  # bytes of rest frames and indices; of sparse matrices and vectors of the solvers
+PER_BODY_FACE, PER_BODY_VERTEX = (240, 140), 60  # bytes of a tree, Warp's on a GPU and ours on a CPU; of two positions
 GRAPHED = 3  # copies of the history on a GPU: of a state, and the input and output of a graph
-INVERTING = 3, 2  # number of float64 matrices while the compliance of a component is made, on a GPU and on a CPU
+INVERTING = 3, 1  # number of float64 matrices while the compliance of a component is made, on a GPU and on a CPU
 LANES = 16  # rows of compliance matrices are padded to a multiple of this
 POISSON_FACTOR, COLLISION_FACTOR = 36.0, 85.0  # bytes of a factor for substitution, per V log2 V of a component
 EXPLICIT_FACTOR = 80.0  # bytes of an inverted factor, per V^1.5 of a component
 FACTOR_ENTRY = 12  # bytes of an entry of a factor
-TOUCHED = 0.2  # share of the vertices of a large component that are in contact at some time, and have a row then
+TOUCHED = 0.5  # share of the vertices of a large component that are in contact at some time, and have a row then
+IN_CONTACT = 0.6  # share of the vertices that are in contact at a time; what scratch has for others is not resident
 MORE_SPLITS = (2, 4, 8, 16, 32, 64)
 
 
@@ -108,7 +109,7 @@ def predict(
     later = history + network.get("packed weights", 0)  # what is not there yet while a scene is made
     passing = {
         "network": network.pop("network", 0),
-        "collision forces": scratch,
+        "collision forces": int(IN_CONTACT**2 * scratch) if cpu else scratch,
         "making weights": max(0, network.pop("making weights", 0) - later),
         "inverting compliance": max(0, INVERTING[cpu] * 8 * inverted - later),
     }
@@ -123,7 +124,7 @@ def predict(
             "meshes and solvers": PER_FACE * faces + PER_VERTEX * vertices,
             "physics": (relax.PER_VERTEX * vertices + relax.PER_FACE * faces + _factors(unique, cpu)) * relaxes,
             "pairs of layers": _pairs([len(garments[i].faces) for outfit in layers for i in outfit]),
-            "bodies": PER_BODY_FACE * body_faces + PER_BODY_VERTEX * body_vertices,
+            "bodies": PER_BODY_FACE[cpu] * body_faces + PER_BODY_VERTEX * body_vertices,
             peak: passing[peak],
         }
         | {f"{c.name}, {purpose}": count for c in correctors for purpose, count in c.memory(sizes).items()}
