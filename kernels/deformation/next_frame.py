@@ -42,7 +42,7 @@ def broken_garments_kernel(
     # Out:
     broken: wp.array[wp.int32],  # marked, not cleared
 ):
-    i = wp.tid()
+    i, _ = wp.tid()  # see compiling.py
     q = velocity[component_of_face[i]]
     if not (wp.isfinite(psi[i]) and wp.isfinite(singular_values[i]) and wp.isfinite(q)):
         broken[garment_of_face[i]] = 1
@@ -89,7 +89,8 @@ def next_gradients_kernel(
     # Out:
     target: wp.array[wp.mat33],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     phi = wp.mat33d()
     for row in range(3):
         for column in range(3):

@@ -147,7 +147,8 @@ def query_bodies_kernel(
     face: wp.array[wp.int32],
     barycentric: wp.array[wp.vec3],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     b = body_of_point[i]
     distance[i] = wp.nan
     closest[i] = wp.vec3(wp.nan)

@@ -145,7 +145,8 @@ def feet_of_tips(
 
     This is a kernel of its own, because two kinds of queries do not fit in the shared memory of a GPU.
     """
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     feet[i] = wp.vec3(wp.nan)
     b = body_of_vertex[faces[i][0]]
     if not exists(bodies, b):
@@ -215,7 +216,8 @@ def depth_between_vertices(
     between: wp.array[wp.float32],
 ):
     """Depth between the vertices of one edge or one face."""
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     corner = wp.vec3i()
     is_face = i >= edges.shape[0]
     if is_face:

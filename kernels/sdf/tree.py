@@ -32,7 +32,7 @@ from warpgarment.kernels.operator import allocate
 
 from .tree_shape import LANES, shape_of
 
-wp.set_module_options(compiling.options())
+wp.set_module_options(compiling.options(max_unroll=1))
 
 ROWS = 17
 FAR = wp.constant(1.0e18)
