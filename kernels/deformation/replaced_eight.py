@@ -103,7 +103,7 @@ REPLACED = """
     if (Lanes::any(flat)) {  // any direction across
         v8 size[3], axis[3];
         for (int k = 0; k < 3; k++) size[k] = __builtin_elementwise_abs(u[0][k]);
-        const m8 x = size[0] < size[1] & size[0] < size[2], y = ~x & size[1] < size[2];
+        const m8 x = size[0] < size[1] & size[0] < size[2], y = ~x & (size[1] < size[2]);
         axis[0] = x ? one : zero;
         axis[1] = y ? one : zero;
         axis[2] = x | y ? zero : one;
