@@ -28,6 +28,7 @@ from .replaced_eight import LANES, replaced_eight_kernel
 from .svd import svd
 
 wp.set_module_options(compiling.options())
+_ONE_BY_ONE = compiling.apart(f"{__name__}.one_by_one")
 
 
 @wp.kernel(enable_backward=False)
@@ -61,7 +62,8 @@ def keep_finite_kernel(
     kept: wp.array[wp.vec3],
     finite: wp.array[wp.uint8],
 ):
-    b = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    b = from_row + thread
     sound = before[b]
     for i in range(start[b], start[b + 1]):
         point = later[i]
@@ -74,7 +76,7 @@ def keep_finite_kernel(
             kept[i] = earlier[i]
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_ONE_BY_ONE, enable_backward=False)
 def next_gradients_kernel(
     from_row: wp.int32,
     # Model:

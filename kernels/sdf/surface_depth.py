@@ -45,7 +45,7 @@ from .tree_boxes import boxes_in_box, triangles_above
 from .tree_search import least, least_above, stack64
 from .vertex_depth import Measured, measured
 
-wp.set_module_options(compiling.options())
+wp.set_module_options(compiling.options(max_unroll=1))
 
 STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""
@@ -258,7 +258,7 @@ def collect_depth(
     deepest: wp.array[wp.float32],  # accumulated
 ):
     """Depths of vertices, edges and faces, in this order, for garments and vertices; on a CPU on one thread."""
-    i = wp.tid()
+    i, _ = wp.tid()  # see compiling.py
     if i < depth.shape[0]:
         if depth[i] > 0.0:
             wp.atomic_max(deepest, garment_of_vertex[i], depth[i])
