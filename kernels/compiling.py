@@ -3,6 +3,13 @@
 Warp compiles a module of kernels whole, when one of them is first launched: `apart` gives those a module of their own
 that a rollout does not launch. Each thread that compiles first reads Warp's headers, once for each set of flags, so
 all modules have the same. `ahead` compiles on all cores what would be compiled one by one.
+
+A kernel that asks for its row with `i = wp.tid()` is compiled twice for a CPU, for arrays without gaps and for any;
+`i, _ = wp.tid()` is compiled once. The row is the same on all devices: the second dimension of a launch of one is one.
+Kernels of a rollout are written so where it saves the compiler's time, and none of them runs slower.
+
+With `max_unroll=1` loops are left to the compiler, which unrolls them too; Warp would write out each pass before. Such
+modules have no adjoints: Warp's adjoint of a loop is right only where the loop was written out, or overwrites nothing.
 """
 
 from __future__ import annotations
@@ -21,8 +28,9 @@ _WARPS_OWN = (
     " -mllvm=-slp-recursion-max-depth=4"
 )
 """Warp's own flags; with thresholds forty times the compiler's, kernels compile a third longer and run no faster."""
-_FLAGS = "-march=native -DWP_NO_BFLOAT16 -fpch-instantiate-templates"
-"""No operators for `wp.bfloat16`, which no kernel here uses; templates are made once, with the headers."""
+_FLAGS = "-march=native -DWP_NO_BFLOAT16 -fpch-instantiate-templates -disable-llvm-verifier -discard-value-names"
+"""No operators for `wp.bfloat16`, which no kernel here uses; templates are made once, with the headers. The compiler
+neither names its values nor checks its own passes, as in releases of Clang, whose driver Warp does without."""
 
 
 def options(**more: Any) -> dict[str, Any]:
@@ -37,14 +45,15 @@ def options(**more: Any) -> dict[str, Any]:
     return {"cpu_compiler_flags": _FLAGS if wp.config.cpu_compiler_flags == _WARPS_OWN else None, **more}
 
 
-def apart(name: str) -> wp.Module:
+def apart(name: str, **more: Any) -> wp.Module:
     """The module of kernels that are not to be compiled with the others of their file: `@wp.kernel(module=apart(...))`.
 
     Args:
         name: Name of the module.
+        more: Options of the module, as of `options`.
     """
     module = wp.get_module(name)
-    wp.set_module_options(options(), module)
+    wp.set_module_options(options(**more), module)
     return module
 
 

@@ -25,7 +25,7 @@ from warpgarment.kernels.sdf.nearest_face import closest_on_triangle
 from .contact_set import ContactFrame, Contacts
 from .way_out import leads_out, way_out
 
-wp.set_module_options(compiling.options())
+wp.set_module_options(compiling.options(max_unroll=1))
 
 AT_SURFACE = wp.constant(wp.float64(1e-7))
 """Below this distance [m] the direction from the closest point is noise, and the normal of the face is used."""
@@ -79,7 +79,8 @@ def find_contacts(
 
     The closest point is computed again in float64: in float32, a direction over 0.1 mm has three digits.
     """
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     n = wp.vec3d()
     u = wp.vec3d()
     keep = epsilon[wp.min(i, epsilon.shape[0] - 1)]

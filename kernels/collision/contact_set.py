@@ -134,7 +134,7 @@ def contact_gap(
     gap: wp.array[wp.float64],
 ):
     """c = d - n·(Ṽ - U) at the contacts, zero elsewhere."""
-    i = wp.tid()
+    i, _ = wp.tid()  # see compiling.py
     n = normal[i]
     c = wp.float64(0.0)
     if wp.dot(n, n) > c:

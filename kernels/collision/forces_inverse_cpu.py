@@ -78,7 +78,8 @@ def wide_contacts(
     error: wp.array[wp.float64],
 ):
     """Forces and displacements of one component; those without a compliance matrix are left as they are."""
-    component = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    component = from_row + thread
     if base[component] >= wp.int64(0):
         first = start[component]
         size = start[component + 1] - first

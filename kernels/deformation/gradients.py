@@ -94,7 +94,7 @@ def inverse_rest_frames_kernel(
     # Out:
     inverse_rest: wp.array[wp.mat33],
 ):
-    i = wp.tid()
+    i, _ = wp.tid()  # see compiling.py
     face = faces[i]
     if not corners_exist(face, rest_vertices.shape[0]):
         inverse_rest[i] = wp.mat33(wp.nan)

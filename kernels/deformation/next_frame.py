@@ -28,6 +28,7 @@ from .replaced_eight import LANES, replaced_eight_kernel
 from .svd import svd
 
 wp.set_module_options(compiling.options())
+_ONE_BY_ONE = compiling.apart(f"{__name__}.one_by_one")
 
 
 @wp.kernel(enable_backward=False)
@@ -42,7 +43,7 @@ def broken_garments_kernel(
     # Out:
     broken: wp.array[wp.int32],  # marked, not cleared
 ):
-    i = wp.tid()
+    i, _ = wp.tid()  # see compiling.py
     q = velocity[component_of_face[i]]
     if not (wp.isfinite(psi[i]) and wp.isfinite(singular_values[i]) and wp.isfinite(q)):
         broken[garment_of_face[i]] = 1
@@ -61,7 +62,8 @@ def keep_finite_kernel(
     kept: wp.array[wp.vec3],
     finite: wp.array[wp.uint8],
 ):
-    b = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    b = from_row + thread
     sound = before[b]
     for i in range(start[b], start[b + 1]):
         point = later[i]
@@ -74,7 +76,7 @@ def keep_finite_kernel(
             kept[i] = earlier[i]
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_ONE_BY_ONE, enable_backward=False)
 def next_gradients_kernel(
     from_row: wp.int32,
     # Model:
@@ -89,7 +91,8 @@ def next_gradients_kernel(
     # Out:
     target: wp.array[wp.mat33],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     phi = wp.mat33d()
     for row in range(3):
         for column in range(3):

@@ -45,7 +45,8 @@ def steps_kernel(
     psi: wp.array[wp.mat33],
     sigma: wp.array[wp.vec3],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     face = wp.int32(index[i])
     if face < 0:
         return

@@ -29,6 +29,7 @@ from .face_blocks import embed_block, first_block, head_block, hear_block, sprea
 from .products import BLOCK, argument
 
 wp.set_module_options(compiling.options())
+_ALONE = compiling.apart(f"{__name__}.alone")
 
 LEAST = 16  # blocks that are worth another range of a launch
 SHARES, SIDES = 4, 3  # patches of a face, and its neighbours
@@ -137,7 +138,7 @@ def hear_kernel(
     )
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(module=_ALONE, enable_backward=False)
 def head_kernel(
     from_row: wp.int32,
     count: wp.int32,

@@ -57,7 +57,8 @@ def heading_kernel(
     around: wp.array[wp.float32],
     faces: wp.array[wp.float32],
 ):
-    r = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    r = from_row + thread
     for p in range(pieces):
         for k in range(3):
             around[3 * (pieces * r + p) + k] = wp.float32(0.0)
@@ -137,7 +138,8 @@ def velocities_kernel(
     # Out:
     result: wp.array[wp.float32],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     to = wp.int32(piece[i])
     if to < 0:
         return

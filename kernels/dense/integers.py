@@ -26,7 +26,7 @@ struct Inner {
     struct Left {
         short* all;
         float* unit;  // of each row
-        inline void row(int i, const float* x, int width) const {
+        __attribute__((noinline)) void row(int i, const float* x, int width) const {
             v16 square = {}, most = {};
             for (int j = 0; j < width; j += 16) {
                 v16 y = Vector::load(x + j);
@@ -52,8 +52,8 @@ struct Inner {
     };
     // after the tiles of b, [pair of rows, column, row of the pair], are the units of its columns
     static inline long size(int columns, int rows) { return (long)columns * (rows / 2 + 1); }
-    static void product(Left a, int lda, const float* right, int depth, int columns, float* c, int ldc,
-                        int down = 32) {
+    __attribute__((noinline)) static void product(Left a, int lda, const float* right, int depth, int columns,
+                                                  float* c, int ldc, int down = 32) {
         const float* units = right + (long)columns * depth * 16;
         for (int n = 0; n < columns; n += 32) {
             const int* b = (const int*)right + (long)(n / 16) * depth * 256;

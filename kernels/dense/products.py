@@ -26,7 +26,8 @@ registers; with AVX2 and NEON, six or four rows and one tile. `Vector` is that o
 
 The kernels that use this are functions in C++ (`wp.func_native`), since Warp's vectors are no registers, and it has no
 word for tiles of AMX. They do nothing where the compiler is told of no vectors, as on GPUs; `available` says whether
-they can be used.
+they can be used. Functions that loop over a row or a product are not inlined: they would be compiled at each call, and
+a call takes no time beside the loop.
 """
 
 from __future__ import annotations
@@ -98,8 +99,8 @@ struct Matrix {
     }
     // a has lda numbers a row; b is packed with `depth` steps in all, of which the first is `from`; rows of c beyond
     // `down` need not be computed
-    static void product(Left a, int lda, const float* right, int from, int steps, int depth, int columns, float* c,
-                        int ldc, int down = 32) {
+    __attribute__((noinline)) static void product(Left a, int lda, const float* right, int from, int steps,
+                                                  int depth, int columns, float* c, int ldc, int down = 32) {
         const long next = 512l * depth;
         for (int n = 0; n < columns; n += 16 * ALONG) {
             const float* b = right + (n / 16) * next + 512l * from;

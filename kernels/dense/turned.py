@@ -76,7 +76,8 @@ def turned_kernel(
     centre: wp.array[wp.float32],
     result: wp.array[wp.float32],
 ):
-    turned_tile(wp.tid(), outputs, frames, channels, weight, mean, turns, centre, result)
+    tile, _ = wp.tid()  # see compiling.py
+    turned_tile(tile, outputs, frames, channels, weight, mean, turns, centre, result)
 
 
 MOST_INPUTS = 1024  # for which a thread has room

@@ -60,7 +60,7 @@ struct Vector {
         v4 b = __builtin_shufflevector(a, a, 0, 1, 2, 3) + __builtin_shufflevector(a, a, 4, 5, 6, 7);
         return (b[0] + b[2]) + (b[1] + b[3]);
     }
-    static inline float norm(const float* x, int width, float* result) {
+    __attribute__((noinline)) static float norm(const float* x, int width, float* result) {
         v16 sum = all(0.0f), square = all(0.0f);
         for (int j = 0; j < width; j += 16) sum += load(x + j);
         v16 mean = all(total(sum) / (float)width);

@@ -36,7 +36,8 @@ def frame_features_kernel(
     # Out:
     features: wp.array2d[wp.float32],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     exist, a, b, c, mean = face_and_mean(i, faces, garment_of_face, vertices, garment_mean, features)
     if not exist:
         return

@@ -130,7 +130,8 @@ def substitute(
     solution: wp.array[wp.vec3d],
 ):
     """One component per thread; rows of components without a factor are not changed."""
-    component = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    component = from_row + thread
     b = base[component]
     if b >= 0:
         begin = start[component]

@@ -39,7 +39,8 @@ def right_hand_side(
     rhs: wp.array[wp.vec3d],
 ):
     """The right-hand side g of solver.py, gathered by each vertex from its corners in a fixed order."""
-    a = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    a = from_row + thread
     v = initial[a]
     g = wp.vec3d()
     e = corner_start[a]

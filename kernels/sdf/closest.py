@@ -26,7 +26,7 @@ from .tree_rays import crossings_by_tree
 from .tree_search import nearest_by_tree
 
 wp.set_module_options(compiling.options())
-SEARCHES = compiling.apart("warpgarment.kernels.sdf.searches")
+SEARCHES = compiling.apart("warpgarment.kernels.sdf.searches", max_unroll=1)
 """The module of all kernels that search closest points: the search, two seconds of the compiler, is compiled once."""
 
 MAX_DISTANCE = wp.constant(1.0e18)  # m; larger than any distance, while its square is still a finite float32
@@ -147,7 +147,8 @@ def query_bodies_kernel(
     face: wp.array[wp.int32],
     barycentric: wp.array[wp.vec3],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     b = body_of_point[i]
     distance[i] = wp.nan
     closest[i] = wp.vec3(wp.nan)

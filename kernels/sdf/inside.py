@@ -189,7 +189,7 @@ def loop_size_kernel(
     loop_size: wp.array[wp.vec2],
 ):
     """Radius [m] and area [m²] of the caps of each loop, both slightly overestimated."""
-    i = wp.tid()
+    i, _ = wp.tid()  # see compiling.py
     radius = wp.float32(0.0)
     area = wp.float32(0.0)
     for k in range(loops[i], loops[i + 1]):

@@ -45,7 +45,7 @@ from .tree_boxes import boxes_in_box, triangles_above
 from .tree_search import least, least_above, stack64
 from .vertex_depth import Measured, measured
 
-wp.set_module_options(compiling.options())
+wp.set_module_options(compiling.options(max_unroll=1))
 
 STANDS_OUT = wp.constant(0.01)
 """Limit l [m]. Of a part that stands out further, lower vertices are found; a spike without any is missed."""
@@ -145,7 +145,8 @@ def feet_of_tips(
 
     This is a kernel of its own, because two kinds of queries do not fit in the shared memory of a GPU.
     """
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     feet[i] = wp.vec3(wp.nan)
     b = body_of_vertex[faces[i][0]]
     if not exists(bodies, b):
@@ -215,7 +216,8 @@ def depth_between_vertices(
     between: wp.array[wp.float32],
 ):
     """Depth between the vertices of one edge or one face."""
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     corner = wp.vec3i()
     is_face = i >= edges.shape[0]
     if is_face:
@@ -256,7 +258,7 @@ def collect_depth(
     deepest: wp.array[wp.float32],  # accumulated
 ):
     """Depths of vertices, edges and faces, in this order, for garments and vertices; on a CPU on one thread."""
-    i = wp.tid()
+    i, _ = wp.tid()  # see compiling.py
     if i < depth.shape[0]:
         if depth[i] > 0.0:
             wp.atomic_max(deepest, garment_of_vertex[i], depth[i])

@@ -32,7 +32,7 @@ from warpgarment.kernels.operator import allocate
 
 from .tree_shape import LANES, shape_of
 
-wp.set_module_options(compiling.options())
+wp.set_module_options(compiling.options(max_unroll=1))
 
 ROWS = 17
 FAR = wp.constant(1.0e18)
@@ -78,7 +78,8 @@ def place_leaves(
     boxes: wp.array3d[wp.float32],
 ):
     """Corners and frames of the triangles of a leaf, and its box in its node."""
-    leaf = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    leaf = from_row + thread
     ax, ay, az = vec8(FAR), vec8(FAR), vec8(FAR)
     bx, by, bz = vec8(FAR), vec8(FAR), vec8(FAR)
     cx, cy, cz = vec8(FAR), vec8(FAR), vec8(FAR)
@@ -224,7 +225,8 @@ def join_boxes(
     boxes: wp.array3d[wp.float32],  # those of leaves are given
 ):
     """Boxes of the nodes of a body in their parents, from the leaves up."""
-    b = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    b = from_row + thread
     for k in range(nodes[b + 1] - nodes[b] - 1):
         node = nodes[b + 1] - 1 - k
         place = places[node]

@@ -50,7 +50,8 @@ def depth_of_vertices(
     depth: wp.array[wp.float32],
     clear: wp.array[wp.float32],
 ):
-    i = from_row + wp.tid()
+    thread, _ = wp.tid()  # see compiling.py
+    i = from_row + thread
     depth[i] = 0.0
     clear[i] = 0.0
     b = body_of_vertex[i]

@@ -26,6 +26,14 @@ def test_modules_share_their_flags():
     assert "-march=native" in compiling.options()["cpu_compiler_flags"]
 
 
+def test_modules_with_loops_that_are_not_written_out_have_no_adjoints():
+    """Gradients would be wrong without a warning: Warp's adjoint of such a loop reads what its last pass overwrote."""
+    kernels = [k for name in NAMES for k in vars(importlib.import_module(name)).values() if isinstance(k, wp.Kernel)]
+    rolled = {k for k in kernels if wp.get_module_options(k.module)["max_unroll"] == 1}
+    assert len({k.module for k in rolled}) >= 5
+    assert not [k.key for k in rolled if k.options.get("enable_backward", True)]
+
+
 def test_flags_of_the_user_are_kept(monkeypatch):
     """Who compiles for another processor than this one, through Warp's own setting, must get what was asked for."""
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", "")
@@ -38,6 +46,8 @@ def test_flags_of_the_user_are_kept(monkeypatch):
         ("warpgarment.kernels.deformation.gradients", "inverse_rest_frames_kernel", "deformation_gradient_kernel"),
         ("warpgarment.kernels.poisson.kernels", "place", "place_adjoint"),
         ("warpgarment.kernels.linear.triangular", "substitute", "multiply_upper"),
+        ("warpgarment.kernels.deformation.next_frame", "keep_finite_kernel", "next_gradients_kernel"),
+        ("warpgarment.kernels.dense.faces", "hear_kernel", "head_kernel"),
     ],
 )
 def test_kernels_apart_do_not_compile_together(of, kernel, other):
