@@ -55,9 +55,8 @@ class Simulator:
         collision_passes: Largest number of collision refinements per frame. They are repeated while any point of a
             garment is more than 0.1 mm deep; 0 leaves them out.
         half: Whether the transformer runs in bfloat16, which is faster on recent GPUs. Geometry stays in float32.
-        graph: Whether what all frames do is recorded and replayed: as one CUDA graph (`graph.py`), which is not
-            replayed while `timings.synchronise` is set, or on a CPU by `kernels/replay`. None and True record it, with
-            the same results; False calls everything anew in each frame.
+        graph: Whether what all frames do is recorded and replayed, as one CUDA graph (`graph.py`) or on a CPU by
+            `kernels/replay`; None does. A graph is not replayed while `timings.synchronise` is set.
 
     Attributes:
         timings: Seconds per stage since the simulator was made, a dict. On CUDA, times are measured only while its
