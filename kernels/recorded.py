@@ -122,8 +122,8 @@ def noted(
     recording: Recording | None, memory: Callable[[Sequence[int], torch.dtype], torch.Tensor] | None
 ) -> Iterator[None]:
     """Context in which the launches of this thread are given to a recording, and memory comes from elsewhere."""
-    notes.recording, notes.memory = recording, memory
     try:
+        notes.recording, notes.memory = recording, memory
         yield
     finally:
         notes.recording = notes.memory = None

@@ -44,12 +44,13 @@ def torch_on_one() -> Iterator[None]:
     if getattr(_local, "count", 0) or torch.get_num_threads() == 1:
         yield
         return
-    _local.count = torch.get_num_threads()
-    torch.set_num_threads(1)
+    before = torch.get_num_threads()
     try:
+        _local.count = before
+        torch.set_num_threads(1)
         yield
     finally:
-        torch.set_num_threads(_local.count)
+        torch.set_num_threads(before)
         _local.count = 0
 
 

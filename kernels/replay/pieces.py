@@ -35,7 +35,7 @@ WARM_UP = 2
 
 
 class _Piece:
-    """One piece: how often it was called, and its recording."""
+    """One piece: how often it was called before its recording, and that."""
 
     def __init__(self, depends: object) -> None:
         self.depends, self.seen, self.failed = depends, 0, False
@@ -95,14 +95,15 @@ class Pieces:
         piece = self._known.get(name)
         if piece is None or piece.depends is not depends:
             piece = self._known[name] = _Piece(depends)
-        piece.seen += 1
-        if piece.failed or piece.seen < WARM_UP:
+            self._drop()
+        if piece.failed:
             return function(*inputs, *frames)
-        if piece.seen == WARM_UP:
-            seen = Observed()
-            with recorded.noted(None, seen):
+        if piece.seen < WARM_UP:
+            observed = Observed()
+            with recorded.noted(None, observed):
                 outputs = function(*inputs, *frames)
-            piece.apart = seen.among(outputs)
+            piece.apart = observed.among(outputs)
+            piece.seen += 1  # not before: a call that was interrupted has warmed nothing up
             return outputs
         if piece.recording is None:
             return self._record(piece, function, inputs, frames)
@@ -111,6 +112,11 @@ class Pieces:
                 held.copy_(given)
         piece.recording.replay(frames)
         return piece.outputs if piece.checks == CHECKS else self._check(key, piece, function, frames)
+
+    def _drop(self) -> None:
+        """Lets go of results of recordings that are forgotten; those that other pieces read in place stay."""
+        used = {id(t) for piece in self._known.values() for t in (*piece.inputs, *piece.outputs)}
+        self._own = {number: t for number, t in self._own.items() if number in used}
 
     def _record(
         self, piece: _Piece, function: Callable[..., Tensors], inputs: Tensors, frames: Sequence[torch.Tensor]
@@ -125,11 +131,12 @@ class Pieces:
         except Unrecordable:
             piece.failed = True
             return function(*inputs, *frames)
-        piece.recording, piece.inputs, piece.outputs = recording, held, outputs
         copied = {id(t) for t, given in zip(held, inputs, strict=True) if t is not given}
         for t in outputs:
             if t is not None and (id(t) in copied or t.untyped_storage().data_ptr() in recording.memory):
                 self._own[id(t)] = t
+        piece.inputs, piece.outputs = held, outputs
+        piece.recording = recording  # last, since an interrupt must not leave half of this
         return outputs
 
     def _check(

@@ -108,7 +108,7 @@ class Recording(TorchFunctionMode):
         options = options or {}
         name = function.__name__
         result = function(*arguments, **options)
-        if name not in ASKS:
+        if name not in ASKS and recorded.notes.recording is self:  # else an interrupt has left this mode behind
             self._note(name, function, arguments, options, result)
         return result
 

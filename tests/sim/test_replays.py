@@ -13,7 +13,10 @@ from support.scenes import body, network, outfit, simulator, skirt, tube, walk
 
 import warpgarment as wg
 from warpgarment.kernels.collision.body_contacts import BodyContacts
+from warpgarment.kernels.collision.solver import CollisionSolver
 from warpgarment.kernels.replay.pieces import CHECKS, WARM_UP
+from warpgarment.kernels.replay.recording import Recording
+from warpgarment.kernels.sdf.bodies import BodyMeshes
 from warpgarment.nn.patches import fused
 from warpgarment.objects.garment import Garment
 from warpgarment.sim.simulator import Simulator
@@ -196,3 +199,61 @@ def test_large_batches_are_not_replayed(fast, monkeypatch):
     assert not state.scene.pieces.on
     assert simulator(network(), graph=True).replay
     assert not simulator(network(), graph=False).replay
+
+
+@pytest.mark.parametrize("what", [(Recording, "replay"), (CollisionSolver, "solve"), (BodyMeshes, "update")])
+def test_frames_that_are_interrupted(what, fast, monkeypatch):
+    """After Ctrl-C, a frame that is stepped again would find search trees that a replay has moved, or a recording that
+    was half made. Exact; every seventh call is interrupted when it has done its work."""
+    motion, calls, missed, (owner, name) = walk(FRAMES), [], 0, what
+    real = getattr(owner, name)
+    plain = Simulator(fast, "cpu", graph=False).rollout(skirt(), motion).vertices
+    sim = Simulator(fast, "cpu")
+    state = sim.start(skirt(), motion.vertices[0], motion.faces)
+
+    def interrupted(*args):
+        result = real(*args)
+        calls.append(name)
+        if len(calls) % 7 == 2:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(owner, name, interrupted)
+    while state.frame + 1 < FRAMES:
+        try:
+            state = sim.step(state, motion.vertices[state.frame + 1])
+        except KeyboardInterrupt:
+            missed += 1
+            continue
+        np.testing.assert_array_equal(state.vertices, plain[state.frame])
+    assert missed
+
+
+def test_a_network_whose_prediction_is_replaced(fast):
+    """Frames would be replayed with the prediction that was recorded. Exact."""
+    motion, results, asked = walk(FRAMES), [], []
+    for graph in (False, None):
+        sim = Simulator(wg.Simulator.from_pretrained("fast", device="cpu").network, "cpu", graph=graph)
+        state = sim.start(skirt(), motion.vertices[0], motion.faces)
+        for t in range(1, FRAMES):
+            if t == FRAMES - 3:
+                real = sim.network.predict
+                sim.network.predict = lambda *args, real=real, **more: asked.append(0) or real(*args, **more)
+            state = sim.step(state, motion.vertices[t])
+        results.append(state.vertices)
+    np.testing.assert_array_equal(*results)
+    assert len(asked) == 2 * 3
+
+
+def test_memory_of_weights_that_change_again_and_again(fast):
+    """Results of recordings that are forgotten would stay: a few arrays for each change of the weights."""
+    made, motion, kept = wg.Simulator.from_pretrained("fast", device="cpu").network, walk(FRAMES), []
+    sim = Simulator(made, "cpu")
+    state = sim.start(skirt(), motion.vertices[0], motion.faces)
+    for _ in range(4):
+        with torch.no_grad():
+            made.face_head.weight.mul_(1.001)
+        for t in range(1, FRAMES):
+            state = sim.step(state, motion.vertices[t])
+        kept.append(len(state.scene.pieces._own))
+    assert kept[-1] == kept[1]

@@ -75,8 +75,8 @@ class GarmentNetwork(nn.Module):
 
     @property
     def takes_frames(self) -> bool:
-        """Whether `predict` takes `Frames`: networks that override it get one tensor."""
-        return type(self).predict is GarmentNetwork.predict
+        """Whether `predict` takes `Frames`: networks that override it, or on which it is set, get one tensor."""
+        return type(self).predict is GarmentNetwork.predict and "predict" not in vars(self)
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()

@@ -31,6 +31,7 @@ class MovingBodies:
     def at(self, vertices: torch.Tensor) -> BodyMeshes:
         """The meshes of the bodies at these positions [m], shape [U,3]."""
         if self.placed is not vertices:
+            self.placed = None  # an interrupt may leave them anywhere
             self._meshes.update(vertices)
             self.placed = vertices
         return self._meshes

@@ -86,7 +86,7 @@ class PatchTransformer(GarmentNetwork):
     @property
     def takes_frames(self) -> bool:
         """As in `GarmentNetwork`."""
-        return type(self).predict is PatchTransformer.predict
+        return type(self).predict is PatchTransformer.predict and "predict" not in vars(self)
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)

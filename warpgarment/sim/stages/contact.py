@@ -147,6 +147,8 @@ class Contact:
         with self._timings("collision"):
             state = Pass(vertices, finite, finite, self._body_of_vertex, self._epsilon)
             passes = self._passes if self._sources else 0
+            if passes and self._replays:
+                self._bodies.placed = None  # a replay moves them, and an interrupt may leave them anywhere
             for number in range(passes):
                 state, *found = self._run("contacts", self._find, number, state, next_body, origin)
                 if not number:
