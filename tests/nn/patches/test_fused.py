@@ -167,6 +167,25 @@ def test_it_has_the_newest_weights(way):
     assert not torch.equal(after.psi, before.psi)
 
 
+@pytest.mark.parametrize("written", ["data", "array"])
+def test_a_scene_begins_with_the_newest_weights(written):
+    """torch counts no change of a weight that is written through `.data` or an array of NumPy: the network would go on
+    with old weights for as long as it lives. Exact: a copy has nothing packed."""
+    made, given = network(), batch(network(), GARMENTS[0])
+    with torch.no_grad():
+        before = made(*given[:3])
+        weight = made.face_head.weight
+        if written == "data":
+            weight.data.mul_(2.0)
+        else:
+            weight.detach().numpy()[:] *= 2.0
+        made.layout(GARMENTS[:1], PackedGarments.pack(GARMENTS[:1], torch.device("cpu")))
+        after, fresh = made(*given[:3]), copy.deepcopy(made)(*given[:3])
+    for one, same in zip(after, fresh, strict=True):
+        assert torch.equal(one, same)
+    assert not torch.equal(after.psi, before.psi)
+
+
 def test_gradients_and_other_widths_are_torchs(monkeypatch):
     """Training would lose its gradients in a kernel that has none, or a kernel read beyond a narrow layer."""
     made = network()

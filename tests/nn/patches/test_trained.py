@@ -54,12 +54,16 @@ def test_gradients_are_those_of_the_layer(hears, faces, width, hidden):
         assert (one - other).norm() <= 3e-5 * other.norm(), name
 
 
-@pytest.mark.parametrize("fused", [None, False, True])
+@pytest.mark.parametrize("fused", [None, False, True, "by hand"])
 def test_weights_that_change_are_packed_anew(fused):
-    """After a step of the optimiser the layer still has its old weights; a fused one does not count its changes."""
+    """After a step of the optimiser the layer still has its old weights; a fused one does not count its changes,
+    nor are those counted that are written by hand after gradients were asked for."""
     layer, sums = layer_of(32, 32, True), neighbours(50)
     before = answers(layer, 50, sums, torch.float32)
-    if fused is None:
+    if fused == "by hand":
+        for parameter in layer.parameters():
+            parameter.data.mul_(1.5)
+    elif fused is None:
         with torch.no_grad():
             for parameter in layer.parameters():
                 parameter.mul_(1.5)

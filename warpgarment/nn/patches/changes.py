@@ -1,12 +1,14 @@
 """Whether weights may have changed since something was made from them.
 
 torch counts the changes of a tensor in its version, but an optimiser that updates all weights in one call
-(`torch.optim.AdamW(fused=True)`) changes them without counting (torch 2.13). So its steps are counted here.
+(`torch.optim.AdamW(fused=True)`) changes them without counting (torch 2.13). So its steps are counted here. What is
+written through `weight.data` or a NumPy array is not counted either: a checksum tells it, where there is time for one.
 """
 
 from __future__ import annotations
 
 import itertools
+import zlib
 from collections.abc import Iterable, Mapping
 from operator import attrgetter, getitem, is_
 from typing import Any
@@ -45,11 +47,19 @@ class Sources:
         self._tensors = [value for value in self._values if value is not None]
         self.counted = not any(tensor.is_inference() for tensor in self._tensors)
         self._state = self._now() if self.counted else None
+        self._sums = self._checksums()
 
     def unchanged(self) -> bool:
         """Whether the modules still have the same tensors, with the same values; False if these are not `counted`."""
         same = all(map(is_, map(getitem, self._places, self._names), self._values))
         return same and self._state is not None and self._state == self._now()
+
+    def written(self) -> bool:
+        """Whether a tensor has other values, whether or not torch has counted that; takes some milliseconds."""
+        return self._sums != self._checksums()
+
+    def _checksums(self) -> list[int]:
+        return [zlib.crc32(t.detach().reshape(-1).cpu().view(torch.uint8).numpy().data) for t in self._tensors]
 
     def _now(self) -> tuple[int, list[int], list[int]]:
         addresses = list(map(torch.Tensor.data_ptr, self._tensors))

@@ -113,6 +113,13 @@ def packed(network: PatchTransformer) -> Packed:
     return known
 
 
+def look(network: PatchTransformer) -> None:
+    """Forgets packed weights if the network's are other ones, also where torch has not counted a change."""
+    known = _known.get(network)
+    if known is not None and known.sources.written():
+        del _known[network]
+
+
 def _sources(network: PatchTransformer) -> changes.Sources:
     """All parameters of a network and the statistics that are part of its weights."""
     parameters = [(module._parameters, name) for module in network.modules() for name in module._parameters]

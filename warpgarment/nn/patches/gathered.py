@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
-from warpgarment.kernels.threads import Aside
+from warpgarment.kernels.threads import Aside, torch_on_one
 
 
 class Gathered:
@@ -24,10 +24,14 @@ class Gathered:
     Args:
         size: Number of entries of the sums, float32.
         finish: Function from the sums [size] to the gradients of the parameters, in their order.
+
+    Attributes:
+        asked: Whether gradients were asked for: the weights may be other ones since then, and nobody may have counted
+            that (`weight.data -= rate * weight.grad`).
     """
 
     def __init__(self, size: int, finish: Callable[[torch.Tensor], Sequence[torch.Tensor | None]]) -> None:
-        self.size, self._finish = size, finish
+        self.size, self._finish, self.asked = size, finish, False
         self._open: dict[int, tuple[torch.Tensor, Aside]] = {}  # by backward pass; an earlier one may have failed
 
     def token(self, parameters: Sequence[torch.Tensor]) -> torch.Tensor:
@@ -49,8 +53,10 @@ class Gathered:
         if found is None:
             return [None] * count
         sums, aside = found
+        self.asked = True
         aside.finish()
-        return self._finish(sums)
+        with torch_on_one():  # its sums depend on the number of threads
+            return self._finish(sums)
 
 
 def behind_norm(

@@ -15,6 +15,7 @@ which have no neighbours, and then on whole garments.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -27,6 +28,8 @@ from warpgarment.nn.inputs import FrameInputs, NormalisedOutput, RowInputs, Vert
 from warpgarment.nn.network import GarmentNetwork
 from warpgarment.nn.parametrisation import Step
 from warpgarment.nn.rows import RowLayout
+from warpgarment.objects.garment import Garment
+from warpgarment.objects.pack import PackedGarments
 
 from . import blocks, first, fused, trained, trained_encoder
 from .bags import Sums, sums_of
@@ -152,6 +155,11 @@ class PatchTransformer(GarmentNetwork):
         if not bfloat16 and blocks.by_blocks(inputs.vertices) and fused.predicts(self, layout):
             return fused.predict(self, inputs, layout)
         return super().predict(inputs, layout, bfloat16=bfloat16)
+
+    def layout(self, garments: Sequence[Garment], packed: PackedGarments, *, face_splits: int = 1) -> RowLayout:
+        """As in `GarmentNetwork`; weights that were written past torch are noticed here, once for each scene."""
+        fused.look(self)
+        return super().layout(garments, packed, face_splits=face_splits)
 
     def replayed(self, layout: RowLayout) -> object | None:
         """As in `GarmentNetwork`, where `predict` is kernels."""

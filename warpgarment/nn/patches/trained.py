@@ -16,6 +16,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products, trained
+from warpgarment.kernels.threads import torch_on_one
 
 from . import changes
 from .fused import packed_weights
@@ -55,7 +56,7 @@ def weights_of(layer: FaceLayer) -> Known:
     versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
     key = changes.optimiser_steps(), tuple(versions)
     known = _packed.get(layer)
-    if known is None or known[0] != key:
+    if known is None or known[0] != key or known[2].asked:
         size = trained.sums_size(layer.expand.in_features, layer.expand.out_features, layer.hears)
         gathered = Gathered(size, functools.partial(_unfolded, [each.detach() for each in parameters]))
         known = key, _pack(layer), gathered, gathered.token(parameters)
@@ -89,6 +90,7 @@ def _unfolded(parameters: list[torch.Tensor], sums: torch.Tensor) -> list[torch.
     ]
 
 
+@torch_on_one()
 @torch.no_grad()
 def _pack(layer: FaceLayer) -> trained.Weights:
     parts = [layer.expand.weight, *([layer.hear.weight] if layer.hears else [])]

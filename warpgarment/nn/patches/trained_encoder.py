@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products
 from warpgarment.kernels.dense import trained_encoder as kernels
+from warpgarment.kernels.threads import torch_on_one
 
 from . import changes
 from .fused import folded
@@ -94,7 +95,7 @@ def _weights(network: PatchTransformer) -> Known:
     versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
     key = changes.optimiser_steps(), tuple(versions)
     known = _known.get(network)
-    if known is None or known[0] != key:
+    if known is None or known[0] != key or known[2].asked:
         weights, root = _pack(network)
         fixed, shape = [each.detach() for each in parameters], _shape(network)
         size = kernels.sums_of(shape).size
@@ -113,6 +114,7 @@ def _shape(network: PatchTransformer) -> kernels.Shape:
     return kernels.Shape(2, 1, *widths, 1, config.layers, 1, 1, 1)
 
 
+@torch_on_one()
 @torch.no_grad()
 def _pack(network: PatchTransformer) -> tuple[kernels.Weights, torch.Tensor]:
     """The weights of the kernels, and the factors [Q] of the rows of queries, keys and values."""
