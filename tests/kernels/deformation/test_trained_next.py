@@ -58,7 +58,8 @@ def test_gradients_are_those_of_the_formula(given, replace, broken, monkeypatch)
     target, finite = trained_next_gradients(*mine, given[3], *owners(), replace=replace, smallest=SMALLEST)
     slope = torch.randn(FACES, 3, 3, generator=torch.Generator().manual_seed(5))
     found = torch.autograd.grad(target, mine, slope)
-    assert len(made) == 4 and not target.isnan().any()
+    assert len(made) == 4
+    assert not target.isnan().any()
     assert finite.tolist() == [True, not broken, True]
     exact = [part.double().requires_grad_() for part in given[:3]]
     expected = twin(exact, kept, replace=replace)

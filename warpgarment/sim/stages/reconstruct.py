@@ -117,7 +117,7 @@ class Reconstruct:
     def gradients(self, step: Step, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Deformation gradients at t+1 [F,3,3], and garments with finite prediction [B]; see `next_gradients`.
 
-        Two launches compute them. If prediction or features require a gradient, a GPU computes them operator by operator.
+        Two launches compute them; on a GPU, if prediction or features require a gradient, operator by operator.
         """
         packed = self._packed
         owners = packed.face_component, packed.garment_of_face, packed.count
