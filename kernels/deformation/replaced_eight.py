@@ -17,7 +17,7 @@ wp.set_module_options(compiling.options())
 
 LANES = 8
 
-REPLACED = """
+LANES_OF_EIGHT = """
 #if !defined(__CUDA_ARCH__)
     typedef double v8 __attribute__((vector_size(64)));
     typedef long long m8 __attribute__((vector_size(64)));
@@ -65,7 +65,53 @@ REPLACED = """
                 vy[k] = swap ? q : vy[k];
             }
         }
+        // columns u of matrices become U, v becomes V, and s the singular values
+        static inline void svd(v8 (*u)[3], v8 (*v)[3], v8* s) {
+            const v8 zero = {}, one = zero + 1.0;
+            for (int i = 0; i < 3; i++)
+                for (int k = 0; k < 3; k++) v[i][k] = i == k ? one : zero;
+            for (int sweep = 0; sweep < 16; sweep++) {
+                m8 turned = turn(u[0], u[1], v[0], v[1]);
+                turned |= turn(u[0], u[2], v[0], v[2]);
+                turned |= turn(u[1], u[2], v[1], v[2]);
+                if (!any(turned)) break;
+            }
+            order(u[0], u[1], v[0], v[1]);
+            order(u[1], u[2], v[1], v[2]);
+            order(u[0], u[1], v[0], v[1]);
+            const v8 first = root(dot(u[0], u[0])), second = root(dot(u[1], u[1]));
+            for (int k = 0; k < 3; k++) u[0][k] = first != 0.0 ? u[0][k] / first : (k ? zero : one);
+            const m8 flat = second <= 1.0e-14 * first;
+            v8 across[3] = {};
+            if (any(flat)) {  // any direction across
+                v8 size[3], axis[3];
+                for (int k = 0; k < 3; k++) size[k] = __builtin_elementwise_abs(u[0][k]);
+                const m8 x = size[0] < size[1] & size[0] < size[2], y = ~x & (size[1] < size[2]);
+                axis[0] = x ? one : zero;
+                axis[1] = y ? one : zero;
+                axis[2] = x | y ? zero : one;
+                cross(u[0], axis, across);
+                const v8 length = root(dot(across, across));
+                for (int k = 0; k < 3; k++) across[k] /= length;
+            }
+            for (int k = 0; k < 3; k++) u[1][k] = flat ? across[k] : u[1][k] / second;
+            v8 last[3], turned[3];
+            cross(u[0], u[1], last);
+            cross(v[0], v[1], turned);
+            s[0] = first;
+            s[1] = second;
+            s[2] = dot(last, u[2]) * dot(turned, v[2]);
+            for (int k = 0; k < 3; k++) {
+                u[2][k] = last[k];
+                v[2][k] = turned[k];
+            }
+        }
     };
+"""
+
+REPLACED = (
+    LANES_OF_EIGHT
+    + """
     const int from = 8 * t, many = count - from < 8 ? count - from : 8;
     v8 f[9] = {}, g[9] = {}, s[3];
     for (int k = 0; k < 9; k += 4) f[k] = g[k] = v8{} + 1.0;
@@ -81,39 +127,10 @@ REPLACED = """
             s[k][r] = (double)(wanted > smallest ? wanted : smallest);
         }
     }
-    v8 u[3][3], v[3][3] = {};  // columns
-    for (int k = 0; k < 3; k++) {
-        v[k][k] = v8{} + 1.0;
+    v8 u[3][3], v[3][3], old[3];  // columns
+    for (int k = 0; k < 3; k++)
         for (int i = 0; i < 3; i++) u[k][i] = g[3 * i] * f[k] + g[3 * i + 1] * f[3 + k] + g[3 * i + 2] * f[6 + k];
-    }
-    for (int sweep = 0; sweep < 16; sweep++) {
-        m8 turned = Lanes::turn(u[0], u[1], v[0], v[1]);
-        turned |= Lanes::turn(u[0], u[2], v[0], v[2]);
-        turned |= Lanes::turn(u[1], u[2], v[1], v[2]);
-        if (!Lanes::any(turned)) break;
-    }
-    Lanes::order(u[0], u[1], v[0], v[1]);
-    Lanes::order(u[1], u[2], v[1], v[2]);
-    Lanes::order(u[0], u[1], v[0], v[1]);
-    const v8 zero = {}, one = zero + 1.0;
-    const v8 first = Lanes::root(Lanes::dot(u[0], u[0])), second = Lanes::root(Lanes::dot(u[1], u[1]));
-    for (int k = 0; k < 3; k++) u[0][k] = first != 0.0 ? u[0][k] / first : (k ? zero : one);
-    const m8 flat = second <= 1.0e-14 * first;
-    v8 across[3] = {};
-    if (Lanes::any(flat)) {  // any direction across
-        v8 size[3], axis[3];
-        for (int k = 0; k < 3; k++) size[k] = __builtin_elementwise_abs(u[0][k]);
-        const m8 x = size[0] < size[1] & size[0] < size[2], y = ~x & (size[1] < size[2]);
-        axis[0] = x ? one : zero;
-        axis[1] = y ? one : zero;
-        axis[2] = x | y ? zero : one;
-        Lanes::cross(u[0], axis, across);
-        const v8 length = Lanes::root(Lanes::dot(across, across));
-        for (int k = 0; k < 3; k++) across[k] /= length;
-    }
-    for (int k = 0; k < 3; k++) u[1][k] = flat ? across[k] : u[1][k] / second;
-    Lanes::cross(u[0], u[1], u[2]);
-    Lanes::cross(v[0], v[1], v[2]);
+    Lanes::svd(u, v, old);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) {
             const v8 x = u[0][i] * s[0] * v[0][j] + u[1][i] * s[1] * v[1][j] + u[2][i] * s[2] * v[2][j];
@@ -121,6 +138,7 @@ REPLACED = """
         }
 #endif
 """
+)
 
 
 @wp.func_native(REPLACED)

@@ -79,7 +79,7 @@ def loss(
         velocity = torch.where(velocity_mask, velocity, 0.0)
         components = velocity_mask.sum() if components is None else components
     velocity = velocity.mean() if components is None else velocity.sum() / components
-    return _summed(deformation, singular_values, velocity, config)
+    return summed(deformation, singular_values, velocity, config)
 
 
 def weighted(
@@ -97,7 +97,7 @@ def weighted(
         (singular_values * face_weight).sum(),
         (velocity * component_weight).sum(),
     )
-    return _summed(*parts, config)
+    return summed(*parts, config)
 
 
 def _differences(
@@ -111,8 +111,9 @@ def _differences(
     return [part.sum(dim=-1) for part in parts]
 
 
-def _summed(
+def summed(
     deformation: torch.Tensor, singular_values: torch.Tensor, velocity: torch.Tensor, config: LossConfig
 ) -> Losses:
+    """The losses of three terms, with their weighted sum."""
     total = config.deformation * deformation + config.singular_values * singular_values + config.velocity * velocity
     return Losses(total, deformation, singular_values, velocity)

@@ -38,17 +38,20 @@ import torch
 from torch import nn
 
 from warpgarment.kernels.deformation.gradients import relative_deformation_gradient
+from warpgarment.kernels.deformation.trained_steps import Rows, Wanted, trained_steps
 from warpgarment.kernels.features.channels import LAYOUT
 from warpgarment.kernels.features.outdoor import packed_columns
+from warpgarment.nn.heading import rotate_vectors
+from warpgarment.nn.inputs import RowInputs
 from warpgarment.nn.network import GarmentNetwork
-from warpgarment.nn.parametrisation import NetworkOutput, Step, compose, context, targets
+from warpgarment.nn.parametrisation import NetworkOutput, Step, StepContext, compose, context, targets
 from warpgarment.nn.rows import PaddedView
-from warpgarment.nn.run import run
+from warpgarment.nn.run import VELOCITY, mirror_rows, normalised, run
 from warpgarment.sim.history import History, Stacks
 from warpgarment.training.samples.unrolled import UnrolledBatch
 
 from .cloth_losses import ClothLossConfig, ClothLosses, ClothState
-from .losses import LossConfig, weighted
+from .losses import LossConfig, summed, weighted
 
 MOST_STEPS = 8  # largest K
 KNOWN = 5e-3  # metres: e, an error that is small enough anywhere
@@ -102,6 +105,14 @@ class Seen(NamedTuple):
     live: list[torch.Tensor]  # [F,34] each, the newest frames of these, to which gradients flow
     velocities: torch.Tensor  # [C,(H-1)*3]
     outside: torch.Tensor | None  # [F,K], channels of the material and the wind
+
+
+class Now(NamedTuple):
+    """The newest frame, packed."""
+
+    vertices: torch.Tensor  # [V,3]
+    features: torch.Tensor  # [F,34]
+    newest: StepContext
 
 
 class UnrolledObjective(nn.Module):
@@ -182,7 +193,6 @@ class UnrolledObjective(nn.Module):
             assert isinstance(stacked, torch.Tensor)  # such stacks are not apart
             live = [*live, features][-config.history :] if features.requires_grad else live
             newest = context(features, scene.packed.face_component, scene.packed.component_count)
-            target = targets(self._wanted(batch, vertices, features, k), newest, residual=config.residual)
             outside = packed_columns(
                 self.network.outdoor,
                 config.fps,
@@ -194,15 +204,14 @@ class UnrolledObjective(nn.Module):
                 batch.air[k],
             )
             seen = Seen(stacked.flatten(1), live, history.velocities.flatten(1), outside)
-            output, terms = self._network(batch, seen, target)
+            predicted = self._by_kernels if features.device.type == "cpu" else self._by_operators
+            step, terms = predicted(batch, seen, Now(vertices, features, newest), k)
             last = k + 1 == len(batch.recorded)
             if last and not self.unroll.position and not self.cloth.terms:
                 yield StepTaken(terms, None, recorded, None)
                 return
             body = batch.bodies[k + 1]
-            solved, finite = scene.reconstruct(
-                vertices, compose(output, newest, residual=config.residual), features, body
-            )
+            solved, finite = scene.reconstruct(vertices, step, features, body)
             before_stage, solved = solved, scene.relax(solved, finite)
             if self.unroll.collision_passes:
                 origin = scene.contact.origin(vertices, features)
@@ -214,49 +223,88 @@ class UnrolledObjective(nn.Module):
                 before, vertices = vertices, solved
                 features = scene.features(vertices, body, batch.bodies[k + 2])
 
-    @staticmethod
-    def _wanted(batch: UnrolledBatch, vertices: torch.Tensor, features: torch.Tensor, k: int) -> Step:
-        """The step that leads from the state to a recorded frame."""
-        scene = batch.scene
-        phi = features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3).contiguous()
+    def _by_operators(self, batch: UnrolledBatch, seen: Seen, now: Now, k: int) -> tuple[Step, torch.Tensor]:
+        """The predicted step, and its losses [4] against a recorded frame."""
+        scene, residual = batch.scene, self.network.config.residual
+        phi = now.features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3).contiguous()
         phi_next, values = batch.stretched[k]
-        velocity = scene.centroids(batch.recorded[k]) - scene.centroids(vertices)
-        return Step(relative_deformation_gradient(phi_next, phi), values, velocity)
-
-    def _network(self, batch: UnrolledBatch, seen: Seen, target: NetworkOutput) -> tuple[NetworkOutput, torch.Tensor]:
-        """Output of the network for packed inputs, and its losses [4] against a target."""
+        velocity = scene.centroids(batch.recorded[k]) - scene.centroids(now.vertices)
+        wanted = Step(relative_deformation_gradient(phi_next, phi), values, velocity)
+        target = targets(wanted, now.newest, residual=residual)
         output = NetworkOutput(*(torch.zeros_like(part) for part in target))
         terms = seen.features.new_zeros(4)
-        for view in batch.scene.layout.views:
-            rows, losses = self._view(batch, view, seen, target)
-            view.add_to(output, rows)
-            terms = terms + losses
-        return output, terms
+        for view in scene.layout.views:
+            rows = self._rows(batch, view, seen)
+            parts = (
+                view.faces(target.psi),
+                view.faces(target.singular_values),
+                view.components(target.velocity),
+            )
+            ran = run(self.network, rows, noise=self.noise, bfloat16=self.in_bfloat16, target=NetworkOutput(*parts))
+            assert ran.target is not None  # as one was given
+            face_weight = view.faces(batch.face_weight)
+            face_weight = face_weight if view.face_mask is None else face_weight * view.face_mask
+            weights = face_weight, self._component_weight(batch, view)
+            losses = weighted(ran.normalised, ran.target, self.network, self.config, *weights)
+            view.add_to(output, ran.output)
+            terms = terms + torch.stack(losses)
+        return compose(output, now.newest, residual=residual), terms
 
-    def _view(
-        self, batch: UnrolledBatch, view: PaddedView, seen: Seen, target: NetworkOutput
-    ) -> tuple[NetworkOutput, torch.Tensor]:
-        """Output of the network for the rows of a view, in world space, and their share of the losses [4]."""
+    def _by_kernels(self, batch: UnrolledBatch, seen: Seen, now: Now, k: int) -> tuple[Step, torch.Tensor]:
+        """The same on a CPU, where what follows the network is one launch for all numbers of the faces of a view."""
+        scene, network, newest = batch.scene, self.network, now.newest
+        physical, residual = self.config.units == "physical", network.config.residual
+        wanted = scene.centroids(batch.recorded[k]) - scene.centroids(now.vertices)
+        if residual:
+            wanted = wanted - newest.body_velocity
+        velocity = torch.zeros_like(wanted)
+        rows, moved = [], wanted.new_zeros(())
+        for view in scene.layout.views:
+            inputs = self._rows(batch, view, seen)
+            said, turn = normalised(network, inputs, noise=self.noise, bfloat16=self.in_bfloat16)
+            assert turn is not None  # as the rows have one
+            assert inputs.mirrored is not None
+            rows.append(Rows(view.index, inputs.mirrored, turn, said.psi.float(), said.singular_values.float()))
+            way = rotate_vectors(mirror_rows(network.denormalise(said).velocity, VELOCITY, inputs.mirrored), turn.mT)
+            view.add_velocities(velocity, way)
+            target = mirror_rows(rotate_vectors(view.components(wanted), turn), VELOCITY, inputs.mirrored)
+            apart = (said.velocity.float() - (target - network.q_mean) / network.q_std).abs()
+            apart = apart * network.q_std if physical else apart
+            moved = moved + (apart.sum(dim=-1) * self._component_weight(batch, view)).sum()
+        deviations = torch.cat([network.psi_std, network.singular_value_std])
+        phi = now.features[:, LAYOUT["deformation_gradient"]].reshape(-1, 3, 3)
+        psi, values, of_faces = trained_steps(
+            phi,
+            rows,
+            Wanted(
+                torch.cat([deviations, network.psi_mean, network.singular_value_mean]),
+                deviations if physical else torch.ones_like(deviations),
+                batch.face_weight,
+                newest.body_rotation if residual else torch.eye(3).expand(len(phi), 3, 3),
+                *batch.stretched[k],
+            ),
+        )
+        step = Step(psi, values, velocity + newest.body_velocity if residual else velocity)
+        return step, torch.stack(summed(of_faces[0], of_faces[1], moved, self.config))
+
+    @staticmethod
+    def _rows(batch: UnrolledBatch, view: PaddedView, seen: Seen) -> RowInputs:
+        """What the network reads for the rows of a view."""
         garment = batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
-        rows = view.inputs(seen.features, seen.velocities, seen.outside)._replace(
+        return view.inputs(seen.features, seen.velocities, seen.outside)._replace(
             turn=batch.turn[garment],
             rest_turn=batch.joint[garment],
             mirrored=batch.mirrored[garment],
             live=tuple(view.faces(frame) for frame in seen.live),
         )
-        wanted = NetworkOutput(
-            view.faces(target.psi), view.faces(target.singular_values), view.components(target.velocity)
-        )
-        ran = run(self.network, rows, noise=self.noise, bfloat16=self.in_bfloat16, target=wanted)
-        assert ran.target is not None  # as one was given
-        face_weight = view.faces(batch.face_weight)
-        face_weight = face_weight if view.face_mask is None else face_weight * view.face_mask
+
+    @staticmethod
+    def _component_weight(batch: UnrolledBatch, view: PaddedView) -> torch.Tensor:
+        """How much each component of a view counts, [R,C]."""
+        garment = batch.scene.packed.garment_of_face[view.face_index[:, 0]].long()
         share = view.share[:, None] / batch.components * batch.counted[garment][:, None]
-        component_weight = share.expand(rows.velocities.shape[:2])
-        if view.component_mask is not None:
-            component_weight = component_weight * view.component_mask
-        losses = weighted(ran.normalised, ran.target, self.network, self.config, face_weight, component_weight)
-        return ran.output, torch.stack(losses)
+        weight = share.expand(view.component_index.shape)
+        return weight if view.component_mask is None else weight * view.component_mask
 
 
 def certainty(batch: UnrolledBatch, floor: float) -> torch.Tensor:

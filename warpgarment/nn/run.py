@@ -66,13 +66,13 @@ def run(
 
 
 def normalised(
-    network: GarmentNetwork, inputs: RowInputs, *, bfloat16: bool = False
+    network: GarmentNetwork, inputs: RowInputs, *, noise: float = 0.0, bfloat16: bool = False
 ) -> tuple[NormalisedOutput, torch.Tensor | None]:
     """The same without what follows the network, and the rotation of each row to the network's frame, [R,3,3] or None.
 
-    The rows must not be mirrored; the other arguments are those of `run`.
+    Rows that are mirrored stay so in the output; the arguments are those of `run`.
     """
-    said, turn, _ = _network(network, inputs, 0.0, bfloat16, None)
+    said, turn, _ = _network(network, inputs, noise, bfloat16, None)
     return said, turn
 
 

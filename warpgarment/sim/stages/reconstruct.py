@@ -117,12 +117,18 @@ class Reconstruct:
     def gradients(self, step: Step, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Deformation gradients at t+1 [F,3,3], and garments with finite prediction [B]; see `next_gradients`.
 
-        Two launches compute them. If prediction or features require a gradient, they are computed operator by operator.
+        Two launches compute them; on a GPU, if prediction or features require a gradient, operator by operator.
         """
         packed = self._packed
-        if step.psi.requires_grad or features.requires_grad:
-            return self._differentiable_gradients(step, features)
         owners = packed.face_component, packed.garment_of_face, packed.count
+        if torch.is_grad_enabled() and (step.psi.requires_grad or features.requires_grad):
+            if self._device.type != "cpu":
+                return self._differentiable_gradients(step, features)
+            from warpgarment.kernels.deformation.trained_next import trained_next_gradients  # a simulation has none
+
+            return trained_next_gradients(
+                features, *step, *owners, replace=self._replace, smallest=SMALLEST_SINGULAR_VALUE
+            )
         return next_gradients(features, *step, *owners, replace=self._replace, smallest=SMALLEST_SINGULAR_VALUE)
 
     def _differentiable_gradients(self, step: Step, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
