@@ -178,7 +178,7 @@ def steps_adjoint_kernel(
 class Rows(NamedTuple):
     """Rows of faces that the network sees together."""
 
-    index: torch.Tensor  # int64 [R,N], packed face of each entry; -1 for padding
+    face: torch.Tensor  # int64 [R,N], packed face of each entry; -1 for padding
     mirrored: torch.Tensor  # bool [R], which rows are mirrored in x
     turn: torch.Tensor  # [R,3,3], rotation to the network's frame
     psi: torch.Tensor  # [R,N,9], what the network says, normalised
@@ -209,7 +209,7 @@ def trained_steps(
     Returns:
         Psi [F,3,3], Sigma [F,3], and the losses of both [2].
     """
-    views = [(each.index, each.mirrored) for each in rows]
+    views = [(each.face, each.mirrored) for each in rows]
     given = [tensor for each in rows for tensor in (each.turn, each.psi, each.values)]
     found: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Steps.apply(wanted, views, phi, *given)
     return found
@@ -234,6 +234,9 @@ def _arguments(wanted: Wanted, phi: torch.Tensor, view: tuple[torch.Tensor, ...]
         as_argument(psi, wp.float32),
         as_argument(values, wp.float32),
     ]
+
+
+_KINDS = wp.mat33, wp.vec3, wp.vec2
 
 
 class _Steps(torch.autograd.Function):
@@ -274,6 +277,3 @@ class _Steps(torch.autograd.Function):
                 found += [made[0].sum(dim=1), *made[1:]]
         ctx.made = None
         return None, None, of_phi, *found
-
-
-_KINDS = wp.mat33, wp.vec3, wp.vec2

@@ -41,7 +41,7 @@ def twin(phi: torch.Tensor, rows: list[Rows], wanted: Wanted) -> tuple[torch.Ten
     psi, values, terms = torch.zeros_like(phi), torch.zeros_like(wanted.values), torch.zeros(2, dtype=phi.dtype)
     (std, mean), mirror = wanted.scale.split(12), torch.tensor([-1.0, 1.0, 1.0], dtype=phi.dtype)
     for each in rows:
-        for r, index in enumerate(each.index):
+        for r, index in enumerate(each.face):
             real = index >= 0
             face, a, b, g = index[real], each.psi[r, real], each.values[r, real], each.turn[r]
             signs = torch.outer(mirror, mirror) if each.mirrored[r] else torch.ones(3, 3, dtype=phi.dtype)
