@@ -100,7 +100,10 @@ class Record:
         """The structure of a launch; TypeError if an argument does not fit."""
         if len(arguments) != self.count:
             raise TypeError("another number of arguments")
-        return self.structure(*[_plain(value) for value in arguments])
+        try:
+            return self.structure(*arguments)
+        except TypeError:  # Warp's arrays and structures
+            return self.structure(*[_plain(value) for value in arguments])
 
     def adjoints(self, values: Sequence[object]) -> Any:
         """The same of adjoints, of which those of constants are None."""

@@ -31,7 +31,7 @@ from warpgarment.nn.rows import RowLayout
 from warpgarment.objects.garment import Garment
 from warpgarment.objects.pack import PackedGarments
 
-from . import blocks, first, fused, trained, trained_encoder
+from . import blocks, first, fused, trained, trained_encoder, trained_head
 from .bags import Sums, sums_of
 from .layout import PatchLayout
 
@@ -244,7 +244,12 @@ class PatchTransformer(GarmentNetwork):
             faces = layer(faces, sums.around)
         with torch.autocast(faces.device.type, enabled=False):
             precise = self.face_head.weight.dtype
-            answer = self.face_head(self.face_norm(faces.to(precise))).unflatten(0, (batch, count))
+            faces = faces.to(precise)
+            if trained_head.fits(self, faces):
+                answer = trained_head.forward(self, faces)
+            else:
+                answer = self.face_head(self.face_norm(faces))
+            answer = answer.unflatten(0, (batch, count))
             psi, singular_values = answer.split([9, 3], dim=-1)
             return NormalisedOutput(psi, singular_values, velocity)
 
