@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products
 from warpgarment.kernels.dense import trained_head as kernels
+from warpgarment.kernels.threads import torch_on_one
 
 from . import changes
 from .fused import folded
@@ -51,8 +52,8 @@ def _weights(network: PatchTransformer) -> Known:
     versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
     key = changes.optimiser_steps(), tuple(versions)
     known = _known.get(network)
-    if known is None or known[0] != key:
-        with torch.no_grad():
+    if known is None or known[0] != key or known[2].asked:
+        with torch.no_grad(), torch_on_one():
             weight, bias = folded(norm, head.weight, head.bias)
         fixed = [each.detach() for each in parameters[:3]]
         gathered = Gathered(weight.numel() + len(bias), functools.partial(_unfolded, fixed))
