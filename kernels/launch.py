@@ -94,7 +94,8 @@ def descriptor(tensor: torch.Tensor, dtype: type, key: tuple[object, ...] | None
         like = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
         like._ref = None  # otherwise the memory would be kept as long as the descriptor
         _descriptors[key] = like
-    made: Any = type(like).from_buffer_copy(like)
+    kind: Any = type(like)
+    made = kind.from_buffer_copy(like)
     made.data = tensor.data_ptr()
     return made
 

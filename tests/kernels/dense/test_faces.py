@@ -6,7 +6,8 @@ import torch.nn.functional as F
 from support.comparing import close
 from support.poison import poison_outputs
 
-from warpgarment.kernels.dense import faces, products, trained
+from warpgarment.kernels.dense import faces, products
+from warpgarment.kernels.dense.trained import layer as trained
 from warpgarment.kernels.dense.turned import turned
 
 pytestmark = pytest.mark.skipif(not products.available(), reason="this processor has no vectors")

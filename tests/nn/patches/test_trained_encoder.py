@@ -10,7 +10,7 @@ import torch
 from support import meshes
 
 from warpgarment.kernels.dense import products
-from warpgarment.kernels.dense import trained_encoder as kernels
+from warpgarment.kernels.dense.trained import encoder as kernels
 from warpgarment.nn.config import NetworkConfig
 from warpgarment.nn.patches import trained_encoder
 from warpgarment.nn.patches.layout import PatchLayout, garment_patches, patch_layout

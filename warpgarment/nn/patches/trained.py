@@ -1,4 +1,4 @@
-"""A layer of faces in training on a CPU: `kernels/dense/trained.py` as a function of autograd.
+"""A layer of faces in training on a CPU: `kernels/dense/trained/layer.py` as a function of autograd.
 
 The scale g and shift s of the layer norm are part of the weights of the kernels, and their gradients follow from those:
 
@@ -15,7 +15,8 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from warpgarment.kernels.dense import products, trained
+from warpgarment.kernels.dense import products
+from warpgarment.kernels.dense.trained import layer as kernels
 from warpgarment.kernels.threads import torch_on_one
 
 from . import changes
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from .network import FaceLayer
 
 Key = tuple[int, tuple[tuple[int, int, bool], ...]]
-Known = tuple[Key, trained.Weights, Gathered, torch.Tensor]
+Known = tuple[Key, kernels.Weights, Gathered, torch.Tensor]
 _packed: WeakKeyDictionary[nn.Module, Known] = WeakKeyDictionary()
 
 
@@ -57,7 +58,7 @@ def weights_of(layer: FaceLayer) -> Known:
     key = changes.optimiser_steps(), tuple(versions)
     known = _packed.get(layer)
     if known is None or known[0] != key or known[2].asked:
-        size = trained.sums_size(layer.expand.in_features, layer.expand.out_features, layer.hears)
+        size = kernels.sums_size(layer.expand.in_features, layer.expand.out_features, layer.hears)
         gathered = Gathered(size, functools.partial(_unfolded, [each.detach() for each in parameters]))
         known = key, _pack(layer), gathered, gathered.token(parameters)
         _packed[layer] = known
@@ -92,20 +93,20 @@ def _unfolded(parameters: list[torch.Tensor], sums: torch.Tensor) -> list[torch.
 
 @torch_on_one()
 @torch.no_grad()
-def _pack(layer: FaceLayer) -> trained.Weights:
+def _pack(layer: FaceLayer) -> kernels.Weights:
     parts = [layer.expand.weight, *([layer.hear.weight] if layer.hears else [])]
     expand = torch.cat([part * layer.norm.weight for part in parts], dim=1)
     bias = layer.expand.bias + sum(part @ layer.norm.bias for part in parts)
     contract = layer.contract.weight
     back = packed_weights(expand.T), packed_weights(contract.T)
-    return trained.Weights(packed_weights(expand), bias, packed_weights(contract), layer.contract.bias.detach(), *back)
+    return kernels.Weights(packed_weights(expand), bias, packed_weights(contract), layer.contract.bias.detach(), *back)
 
 
-def _around(around: Sums | None) -> trained.Around:
+def _around(around: Sums | None) -> kernels.Around:
     if around is None:
         empty = torch.zeros(0, dtype=torch.int64)
-        return trained.Around(empty, empty, empty)
-    return trained.Around(around.forward.entry, around.back.start, around.back.entry)
+        return kernels.Around(empty, empty, empty)
+    return kernels.Around(around.forward.entry, around.back.start, around.back.entry)
 
 
 class _Layer(torch.autograd.Function):
@@ -114,11 +115,11 @@ class _Layer(torch.autograd.Function):
         ctx: Any,
         faces: torch.Tensor,
         token: torch.Tensor,
-        weights: trained.Weights,
+        weights: kernels.Weights,
         gathered: Gathered,
-        around: trained.Around,
+        around: kernels.Around,
     ) -> torch.Tensor:
-        result, found = trained.layer(faces, weights, around)
+        result, found = kernels.layer(faces, weights, around)
         ctx.made, ctx.of_weights = (weights, gathered, around, found), token.requires_grad
         return result
 
@@ -128,10 +129,10 @@ class _Layer(torch.autograd.Function):
         weights, gathered, around, found = ctx.made
         ctx.made, of_token = None, None
         gradient = gradient.contiguous()
-        of_faces, slopes = trained.gradients(gradient, found, weights, around)
+        of_faces, slopes = kernels.gradients(gradient, found, weights, around)
         if ctx.of_weights:
             sums, aside = gathered.sums()
-            for call in trained.outer(gradient, slopes, found, around, sums):
+            for call in kernels.outer(gradient, slopes, found, around, sums):
                 aside.add(call)
             of_token = sums.new_zeros(())
         return of_faces, of_token, None, None, None

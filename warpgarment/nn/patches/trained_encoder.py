@@ -1,4 +1,4 @@
-"""The encoder on patches in training on a CPU: `kernels/dense/trained_encoder.py` as a function of autograd.
+"""The encoder on patches in training on a CPU: `kernels/dense/trained/encoder.py` as a function of autograd.
 
 The scale g and shift s of a layer norm are part of the weights of the kernels, as in trained.py.
 """
@@ -13,7 +13,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products
-from warpgarment.kernels.dense import trained_encoder as kernels
+from warpgarment.kernels.dense.trained import encoder as kernels
 from warpgarment.kernels.threads import torch_on_one
 
 from . import changes

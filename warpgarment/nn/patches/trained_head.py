@@ -1,4 +1,4 @@
-"""The head of faces in training on a CPU: `kernels/dense/trained_head.py` as a function of autograd.
+"""The head of faces in training on a CPU: `kernels/dense/trained/head.py` as a function of autograd.
 
 The scale and shift of the layer norm are part of the weights of the kernels, as in trained.py.
 """
@@ -14,7 +14,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products
-from warpgarment.kernels.dense import trained_head as kernels
+from warpgarment.kernels.dense.trained import head as kernels
 from warpgarment.kernels.threads import torch_on_one
 
 from . import changes

@@ -19,11 +19,11 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
+from warpgarment.kernels.dense.products import BLOCK, argument
 from warpgarment.kernels.launch import launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from .encoder_blocks import encoder_row, gradient_row, outer_part
-from .products import BLOCK, argument
 
 wp.set_module_options(compiling.options())
 

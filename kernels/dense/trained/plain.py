@@ -10,8 +10,8 @@ used once. The order of the sums does not depend on M or N.
 
 from __future__ import annotations
 
-from .products import VECTORS_GUARD
-from .vectors import TEXT
+from warpgarment.kernels.dense.products import VECTORS_GUARD
+from warpgarment.kernels.dense.vectors import TEXT
 
 PLAIN = """
 struct Plain {

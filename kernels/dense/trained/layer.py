@@ -20,11 +20,11 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
+from warpgarment.kernels.dense.products import BLOCK, argument
 from warpgarment.kernels.launch import launch, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
-from .products import BLOCK, argument
-from .trained_blocks import back_block, layer_block, norm_block, outer_faces, slope_block
+from .layer_blocks import back_block, layer_block, norm_block, outer_faces, slope_block
 
 wp.set_module_options(compiling.options())
 

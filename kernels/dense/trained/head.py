@@ -4,7 +4,7 @@ With n(x) = (x - mean) / deviation over the numbers of a face:
 
     y = W n(x) + b        dx = n'(x)^T W^T dy,   dW = sum dy n(x)^T,   db = sum dy
 
-The scale and shift of the layer norm belong to W and b, as in trained.py. A product that narrow is no work for tiles:
+The scale and shift of the layer norm belong to W and b, as in layer.py. A product that narrow is no work for tiles:
 every number of y is a sum along a face.
 """
 
@@ -18,11 +18,11 @@ import torch
 import warp as wp
 
 from warpgarment.kernels import compiling
+from warpgarment.kernels.dense.products import BLOCK, argument, source
 from warpgarment.kernels.launch import launch, launch_rows, torch_stream
 from warpgarment.kernels.operator import allocate
 
 from . import plain
-from .products import BLOCK, argument, source
 
 wp.set_module_options(compiling.options())
 

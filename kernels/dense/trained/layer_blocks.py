@@ -1,4 +1,4 @@
-"""What a thread of trained.py does, in C++: a layer of faces and its gradients.
+"""What a thread of layer.py does, in C++: a layer of faces and its gradients.
 
 Products with weights are those of products.py; sums over faces are outer products of plain.py.
 """
@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from warpgarment.kernels.dense.products import source
+
 from . import plain
-from .products import source
 
 HEARD = """
 struct Heard {

@@ -1,4 +1,4 @@
-"""What a thread of trained_encoder.py does, in C++ with the products of plain.py: the encoder on the patches of a row.
+"""What a thread of encoder.py does, in C++ with the products of plain.py: the encoder on the patches of a row.
 
 Symbols are those of tokens.py.
 """
@@ -48,7 +48,7 @@ SIZES = """
                 Vector::store(y + j, Vector::fma(Vector::all(weight), Vector::load(x + j), Vector::load(y + j)));
         }
     };
-    // what the forward pass keeps of a row: see `places` of trained_encoder.py
+    // what the forward pass keeps of a row: see `places` of encoder.py
     const long TE = (long)T * E, TQ = (long)T * Q, TH = (long)T * H, PROBABLE = D ? (long)(L / D) * T * Tp : 0;
     const long LAYER = 3 * TE + TQ + PROBABLE + 2 * TH + 2 * T;
     const long KEPT = (long)P * (F + E) + (long)C * (F + E + 1) + layers * LAYER;

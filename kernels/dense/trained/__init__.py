@@ -1,0 +1,1 @@
+"""Layers of networks in training on a CPU: kernels forward and back."""
