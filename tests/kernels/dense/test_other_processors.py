@@ -27,7 +27,7 @@ import importlib, sys, torch, warp as wp
 for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported", "_init_amx"):
     setattr(torch.cpu, name, lambda: True)
 wp.config.cpu_compiler_flags = "-target-cpu sapphirerapids"
-for name in ("products", "faces", "tokens", "turned", "trained", "trained_encoder"):
+for name in ("products", "faces", "tokens", "turned", "trained.layer", "trained.encoder", "trained.head"):
     module = importlib.import_module("warpgarment.kernels.dense." + name)
     wp.compile_aot_module(wp.get_module(module.__name__), device="cpu", module_dir=sys.argv[1])
 assert importlib.import_module("warpgarment.kernels.dense.products").ON_TILES
@@ -44,7 +44,8 @@ def run(code: str, *arguments: str) -> None:
 def test_with_vectors_of_avx2():
     """Most desktop processors would get wrong numbers: what AVX-512 has instructions for is written out there."""
     run(AVX2, *(f"tests/{name}" for name in ("kernels/dense/test_faces.py", "kernels/dense/test_tokens.py")),
-        "tests/nn/patches/test_trained.py", "tests/nn/patches/test_trained_encoder.py")  # fmt: skip
+        "tests/nn/patches/test_trained.py",
+        "tests/nn/patches/test_trained_encoder.py", "tests/nn/patches/test_trained_head.py")  # fmt: skip
 
 
 def test_tiles_of_amx_compile(tmp_path):
