@@ -19,10 +19,11 @@ def test_each_build_runs_its_own_code(tmp_path):
         worker = Worker(python_of("HEAD", tmp_path), 1)
         assert str(tmp_path) in worker.about["package"]
         motions = demo_motions(tmp_path)
-        worker.ask("prepare", "case", "next", {"starts": [0], "motions": motions})
+        worker.ask("prepare", "case", "next", {"starts": [0], "motions": motions, "noise": 1e-7, "seeds": [0, 1]})
         answers = worker.ask("run", "case")["result"]
         worker.close()
-        assert [name for name, _, _ in answers] == motions
+        assert [name for name, _, _ in answers] == [name for name in motions for _ in range(2)]
+        assert not np.array_equal(answers[0][2], answers[1][2])
         assert len(motions) == 2
         assert all(np.isfinite(np.array(positions)).all() for _, _, positions in answers)
     finally:
