@@ -10,12 +10,21 @@ finished and become the gradients of the weights.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+from weakref import WeakKeyDictionary
 
 import torch
+from torch import nn
 from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.threads import Aside, torch_on_one
+
+from . import changes
+
+Finish = Callable[[torch.Tensor], Sequence[torch.Tensor | None]]
+M = TypeVar("M", bound=nn.Module)
+W = TypeVar("W")
 
 
 class Gathered:
@@ -30,7 +39,7 @@ class Gathered:
             that (`weight.data -= rate * weight.grad`).
     """
 
-    def __init__(self, size: int, finish: Callable[[torch.Tensor], Sequence[torch.Tensor | None]]) -> None:
+    def __init__(self, size: int, finish: Finish) -> None:
         self.size, self._finish, self.asked = size, finish, False
         self._open: dict[int, tuple[torch.Tensor, Aside]] = {}  # by backward pass; an earlier one may have failed
 
@@ -57,6 +66,46 @@ class Gathered:
         aside.finish()
         with torch_on_one():  # its sums depend on the number of threads
             return self._finish(sums)
+
+
+@dataclass(frozen=True)
+class Made(Generic[W]):
+    """What is made of the weights of a module."""
+
+    weights: W  # as kernels read them
+    size: int  # of the sums
+    finish: Finish  # as of `Gathered`
+
+
+class Packed(Generic[M, W]):
+    """Packed weights of modules and what gathers their gradients, made anew when a weight may have changed.
+
+    Args:
+        parameters: Function from a module to its parameters, in the order of their gradients.
+        make: Function from a module and its parameters, without gradients, to what is made of them. It runs on one
+            thread, on whose number sums of torch depend.
+    """
+
+    def __init__(
+        self,
+        parameters: Callable[[M], list[torch.Tensor]],
+        make: Callable[[M, list[torch.Tensor]], Made[W]],
+    ) -> None:
+        self._parameters, self._make = parameters, make
+        self._known: WeakKeyDictionary[M, tuple[object, W, Gathered, torch.Tensor]] = WeakKeyDictionary()
+
+    def __call__(self, module: M) -> tuple[W, Gathered, torch.Tensor]:
+        """The weights of a module, what gathers their gradients, and its token."""
+        parameters = self._parameters(module)
+        versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
+        key = changes.optimiser_steps(), versions
+        known = self._known.get(module)
+        if known is None or known[0] != key or known[2].asked:
+            with torch_on_one(), torch.no_grad():
+                made = self._make(module, [each.detach() for each in parameters])
+            gathered = Gathered(made.size, made.finish)
+            known = self._known[module] = key, made.weights, gathered, gathered.token(parameters)
+        return known[1:]
 
 
 def behind_norm(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import nn
@@ -17,19 +16,13 @@ from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products
 from warpgarment.kernels.dense.trained import layer as kernels
-from warpgarment.kernels.threads import torch_on_one
 
-from . import changes
 from .fused import packed_weights
-from .gathered import Gathered, behind_norm
+from .gathered import Gathered, Made, Packed, behind_norm
 
 if TYPE_CHECKING:
     from .bags import Sums
     from .network import FaceLayer
-
-Key = tuple[int, tuple[tuple[int, int, bool], ...]]
-Known = tuple[Key, kernels.Weights, Gathered, torch.Tensor]
-_packed: WeakKeyDictionary[nn.Module, Known] = WeakKeyDictionary()
 
 
 def fits(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> bool:
@@ -45,24 +38,10 @@ def fits(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> bool:
 
 def forward(layer: FaceLayer, faces: torch.Tensor, around: Sums | None) -> torch.Tensor:
     """`FaceLayer.forward` of faces [N,F]."""
-    _, weights, gathered, token = weights_of(layer)
+    weights, gathered, token = weights_of(layer)
     heard = _around(around if layer.hears else None)
     result: torch.Tensor = _Layer.apply(faces, token, weights, gathered, heard)
     return result
-
-
-def weights_of(layer: FaceLayer) -> Known:
-    """The packed weights of a layer and what gathers their gradients, made anew when one has changed."""
-    parameters = _parameters(layer)
-    versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
-    key = changes.optimiser_steps(), tuple(versions)
-    known = _packed.get(layer)
-    if known is None or known[0] != key or known[2].asked:
-        size = kernels.sums_size(layer.expand.in_features, layer.expand.out_features, layer.hears)
-        gathered = Gathered(size, functools.partial(_unfolded, [each.detach() for each in parameters]))
-        known = key, _pack(layer), gathered, gathered.token(parameters)
-        _packed[layer] = known
-    return known
 
 
 def _parameters(layer: FaceLayer) -> list[torch.Tensor]:
@@ -91,15 +70,17 @@ def _unfolded(parameters: list[torch.Tensor], sums: torch.Tensor) -> list[torch.
     ]
 
 
-@torch_on_one()
-@torch.no_grad()
-def _pack(layer: FaceLayer) -> kernels.Weights:
-    parts = [layer.expand.weight, *([layer.hear.weight] if layer.hears else [])]
-    expand = torch.cat([part * layer.norm.weight for part in parts], dim=1)
-    bias = layer.expand.bias + sum(part @ layer.norm.bias for part in parts)
-    contract = layer.contract.weight
+def _make(layer: FaceLayer, parameters: list[torch.Tensor]) -> Made[kernels.Weights]:
+    scale, shift, bias, contract, contract_bias, *parts = parameters
+    expand = torch.cat([part * scale for part in parts], dim=1)
+    bias = bias + sum(part @ shift for part in parts)
     back = packed_weights(expand.T), packed_weights(contract.T)
-    return kernels.Weights(packed_weights(expand), bias, packed_weights(contract), layer.contract.bias.detach(), *back)
+    weights = kernels.Weights(packed_weights(expand), bias, packed_weights(contract), contract_bias, *back)
+    size = kernels.sums_size(layer.expand.in_features, layer.expand.out_features, layer.hears)
+    return Made(weights, size, functools.partial(_unfolded, parameters))
+
+
+weights_of = Packed(_parameters, _make)
 
 
 def _around(around: Sums | None) -> kernels.Around:

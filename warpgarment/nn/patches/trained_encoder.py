@@ -6,7 +6,6 @@ The scale g and shift s of a layer norm are part of the weights of the kernels, 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import nn
@@ -14,21 +13,15 @@ from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products
 from warpgarment.kernels.dense.trained import encoder as kernels
-from warpgarment.kernels.threads import torch_on_one
 
-from . import changes
 from .fused import folded
-from .gathered import Gathered, behind_norm
+from .gathered import Gathered, Made, Packed, behind_norm
 
 if TYPE_CHECKING:
     from warpgarment.nn.attention import EncoderLayer
 
     from .layout import PatchLayout
     from .network import PatchTransformer
-
-Key = tuple[int, tuple[tuple[int, int, bool], ...]]
-Known = tuple[Key, kernels.Weights, Gathered, torch.Tensor]
-_known: WeakKeyDictionary[nn.Module, Known] = WeakKeyDictionary()
 
 
 def fits(network: PatchTransformer, faces: torch.Tensor, layout: PatchLayout) -> bool:
@@ -65,7 +58,7 @@ def forward(
     Returns:
         Faces with what they hear of the patches [R,N,F]; normalised velocities [R,C,3].
     """
-    _, weights, gathered, token = _weights(network)
+    weights, gathered, token = _weights(network)
     real = None if mask is None else mask.flatten(1)
     pooled = layout.start, layout.member, layout.member_weight
     pools = kernels.Pools(*pooled, layout.patch, layout.share, layout.pieces, layout.weights, real)
@@ -89,20 +82,10 @@ def _parameters(network: PatchTransformer) -> list[torch.Tensor]:
     return [*found, network.to_velocity.weight, last.weight, last.bias, head.weight, head.bias]
 
 
-def _weights(network: PatchTransformer) -> Known:
-    """The weights of the kernels, and what gathers their gradients; made anew when one has changed."""
-    parameters = _parameters(network)
-    versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
-    key = changes.optimiser_steps(), tuple(versions)
-    known = _known.get(network)
-    if known is None or known[0] != key or known[2].asked:
-        weights, root = _pack(network)
-        fixed, shape = [each.detach() for each in parameters], _shape(network)
-        size = kernels.sums_of(shape).size
-        gathered = Gathered(size, lambda sums: _unfolded(shape, fixed, root, sums))
-        known = key, weights, gathered, gathered.token(parameters)
-        _known[network] = known
-    return known
+def _make(network: PatchTransformer, parameters: list[torch.Tensor]) -> Made[kernels.Weights]:
+    weights, root = _pack(network)
+    shape = _shape(network)
+    return Made(weights, kernels.sums_of(shape).size, lambda sums: _unfolded(shape, parameters, root, sums))
 
 
 def _shape(network: PatchTransformer) -> kernels.Shape:
@@ -114,8 +97,6 @@ def _shape(network: PatchTransformer) -> kernels.Shape:
     return kernels.Shape(2, 1, *widths, 1, config.layers, 1, 1, 1)
 
 
-@torch_on_one()
-@torch.no_grad()
 def _pack(network: PatchTransformer) -> tuple[kernels.Weights, torch.Tensor]:
     """The weights of the kernels, and the factors [Q] of the rows of queries, keys and values."""
     shape = _shape(network)
@@ -160,6 +141,9 @@ def _unfolded(
     scale, shift, head, _ = parameters[-4:]
     norm, weight, bias = behind_norm(*slopes["velocity"], scale, shift, head)
     return [*found, *slopes["heard"], *slopes["pool"], slopes["lift"][0], *norm, weight, bias]
+
+
+_weights = Packed(_parameters, _make)
 
 
 class _Encoder(torch.autograd.Function):

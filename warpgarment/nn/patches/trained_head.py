@@ -7,26 +7,18 @@ from __future__ import annotations
 
 import functools
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import torch
-from torch import nn
 from torch.autograd.function import once_differentiable
 
 from warpgarment.kernels.dense import products
 from warpgarment.kernels.dense.trained import head as kernels
-from warpgarment.kernels.threads import torch_on_one
 
-from . import changes
 from .fused import folded
-from .gathered import Gathered, behind_norm
+from .gathered import Gathered, Made, Packed, behind_norm
 
 if TYPE_CHECKING:
     from .network import PatchTransformer
-
-Key = tuple[int, tuple[tuple[int, int, bool], ...]]
-Known = tuple[Key, kernels.Weights, Gathered, torch.Tensor]
-_known: WeakKeyDictionary[nn.Module, Known] = WeakKeyDictionary()
 
 
 def fits(network: PatchTransformer, faces: torch.Tensor) -> bool:
@@ -40,26 +32,20 @@ def fits(network: PatchTransformer, faces: torch.Tensor) -> bool:
 
 def forward(network: PatchTransformer, faces: torch.Tensor) -> torch.Tensor:
     """`face_head(face_norm(faces))` of faces [N,F]."""
-    _, weights, gathered, token = _weights(network)
+    weights, gathered, token = _weights(network)
     result: torch.Tensor = _Head.apply(faces, token, weights, gathered)
     return result
 
 
-def _weights(network: PatchTransformer) -> Known:
-    """The weights of the kernels, and what gathers their gradients; made anew when one has changed."""
+def _parameters(network: PatchTransformer) -> list[torch.Tensor]:
+    """The parameters in the order in which their gradients are found."""
     norm, head = network.face_norm, network.face_head
-    parameters = [norm.weight, norm.bias, head.weight, head.bias]
-    versions = [(each.data_ptr(), changes.version(each), each.requires_grad) for each in parameters]
-    key = changes.optimiser_steps(), tuple(versions)
-    known = _known.get(network)
-    if known is None or known[0] != key or known[2].asked:
-        with torch.no_grad(), torch_on_one():
-            weight, bias = folded(norm, head.weight, head.bias)
-        fixed = [each.detach() for each in parameters[:3]]
-        gathered = Gathered(weight.numel() + len(bias), functools.partial(_unfolded, fixed))
-        known = key, kernels.Weights(weight, bias), gathered, gathered.token(parameters)
-        _known[network] = known
-    return known
+    return [norm.weight, norm.bias, head.weight, head.bias]
+
+
+def _make(network: PatchTransformer, parameters: list[torch.Tensor]) -> Made[kernels.Weights]:
+    weight, bias = folded(network.face_norm, *parameters[2:])
+    return Made(kernels.Weights(weight, bias), weight.numel() + len(bias), functools.partial(_unfolded, parameters[:3]))
 
 
 def _unfolded(parameters: list[torch.Tensor], sums: torch.Tensor) -> list[torch.Tensor]:
@@ -68,6 +54,9 @@ def _unfolded(parameters: list[torch.Tensor], sums: torch.Tensor) -> list[torch.
     slope, of_bias = sums.split([weight.numel(), len(weight)])
     norm, of_weight, of_bias = behind_norm(slope.view(weight.shape), of_bias, scale, shift, weight)
     return [*norm, of_weight, of_bias]
+
+
+_weights = Packed(_parameters, _make)
 
 
 class _Head(torch.autograd.Function):
