@@ -29,12 +29,12 @@ from benchmarks.measure import RESULTS, Row, figures, interleaved, machine
 from benchmarks.networks import Named
 from benchmarks.scenes import dressed
 from warpgarment.io.disk.atomic import atomic_files
+from warpgarment.kernels.replay.pieces import FIRST
 from warpgarment.sim.simulator import Simulator
 from warpgarment.training.teachers import TEACHERS, Cloth, ClothScene, Teacher, TeacherError, make_teacher
 from warpgarment.view.markdown import table
 
 WORLDS = {"cpu": (1, 4), "cuda": (1, 4, 16, 64, 256, 1024)}
-FIRST = 12  # frames of ours before those that are timed: in the first ones it is recorded what later ones do
 STARTS = 24  # number of frames of the walk at which worlds start
 
 
@@ -97,7 +97,7 @@ def against(faces: list[int], device: torch.device, networks: Sequence[Named], f
             f"ours: {label}": Rolling(Simulator(network, device), scenes_of([size], 1)) for label, network in networks
         }
         for roll in rolling.values():
-            for _ in range(FIRST):
+            for _ in range(FIRST + 2):
                 roll()
         times = interleaved({**rolling, "VBD": lambda s=stream: next(s)}, device, 1e9, most=frames - 1)
         vbd = {f"reference_{key}": value for key, value in figures(times["VBD"]).items()}

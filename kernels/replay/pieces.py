@@ -3,7 +3,7 @@
 A frame is some forty launches and a hundred small operators of torch, most of which make or view tensors. Their shapes
 and constants never change, so what a piece did can be done again in the same memory, as a CUDA graph does on a GPU:
 
-    run("contact", function, a, b)     at first calls the function;
+    run("contact", function, a, b)     at first, ten times, calls the function;
                                        then calls it and keeps its launches, the operators of torch that compute
                                        something, and all tensors;
                                        then replays these, and calls the function too, to compare all bits;
@@ -30,8 +30,11 @@ Tensors = tuple[Any, ...]  # some may be None
 
 CHECKS = 3
 """Calls in which a replay is compared with the function."""
-WARM_UP = 2
-"""Calls of a piece before it is recorded: kernels are loaded, and constants made."""
+WARM_UP = 10
+"""Calls of a piece before it is recorded: kernels are loaded and constants made, and a short rollout is over, which
+would not win back what a recording costs."""
+FIRST = WARM_UP + 1 + CHECKS
+"""Calls before the first one that is only replayed."""
 
 
 class _Piece:

@@ -10,7 +10,7 @@ import warpgarment as wg
 assets = wg.demo.assets()
 dress = assets.garments["dress"]
 simulator = wg.Simulator.from_pretrained("fast", device="cpu")
-simulator.rollout(dress.garment, assets.collider, first_vertices=dress.first_vertices, frames=10)
+simulator.rollout(dress.garment, assets.collider, first_vertices=dress.first_vertices, frames=20)
 print([name for name in ("torch._dynamo", "torch._inductor", "sympy", "matplotlib", "pxr") if name in sys.modules])
 """
 
